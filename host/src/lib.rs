@@ -1,0 +1,6 @@
+//! Renders the direct light of area lights with the `occlude` kernel.
+
+pub mod error;
+pub mod scene;
+
+pub use error::{Error, Result};

@@ -1,0 +1,1 @@
+//! Oracles and shared set-up for the tests.
