@@ -1,3 +1,37 @@
 #![no_std]
 #![forbid(unsafe_code)]
-//! Visibility queries.
+//! Visibility for soft shadows: is there anything between these points, and what?
+//!
+//! No std, no heap, no unsafe code, no global state and no random numbers: slices and numbers come from the
+//! caller. The caller builds a tree (or lets `occlude-host` do it), borrows it to a [`Bvh`], and asks.
+//!
+//! ```
+//! use occlude_kernel::{Bvh, Child, Node, Ray, TriangleBlock, Uncounted};
+//!
+//! let mut block = TriangleBlock::EMPTY;
+//! block.set(0, [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0]], 7);
+//! let mut root = Node::EMPTY;
+//! root.set(0, [-1.0, -1.0, 1.0], [1.0, 1.0, 1.0], Child::leaf(0));
+//!
+//! let (nodes, blocks) = ([root], [block]);
+//! let bvh = Bvh::new(&nodes, &blocks)?;
+//! let through = Ray::segment([0.0, 0.0, 0.0], [0.0, 0.0, 2.0]);
+//! assert_eq!(bvh.occluder(&through, None, &mut Uncounted), Some(7));
+//! assert!(!bvh.occluded(&through, Some(7), &mut Uncounted));
+//! assert!(!bvh.occluded(&Ray::segment([0.0, 0.0, 0.0], [0.0, 0.0, 0.5]), None, &mut Uncounted));
+//! # Ok::<(), occlude_kernel::BvhError>(())
+//! ```
+//!
+//! Features: `dispatch` chooses vectors at run time ([`lanes`]); `std` lets it ask the CPU which it has.
+
+pub mod bvh;
+pub mod counter;
+pub mod lanes;
+pub mod ray;
+pub mod triangle;
+
+pub use bvh::{Bvh, BvhError, Child, HitPacket, Node, Targets, offset};
+pub use counter::{Counter, Counts, Uncounted};
+pub use lanes::{Native, Scalar, Simd};
+pub use ray::{Hit, Ray, RayPacket};
+pub use triangle::{NO_TRIANGLE, TriangleBlock};

@@ -1,0 +1,347 @@
+//! Builds the tree that the kernel walks, and owns what it borrows.
+//!
+//! obvhs builds a binary tree with one triangle a leaf (PLOC with parallel reinsertion). It is then cut into
+//! nodes of eight children and blocks of up to eight triangles so that the expected cost of a ray, by the
+//! surface area heuristic, is least over all ways of cutting it: the dynamic programme of Ylitie, Karras and
+//! Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs" (HPG 2017), section 3.1.
+
+use crate::scene::Scene;
+use glam::Vec3;
+use obvhs::bvh2::Bvh2;
+use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
+use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
+use occlude_kernel::bvh::MAX_DEPTH;
+use occlude_kernel::{Bvh, Child, Node, TriangleBlock};
+
+/// How long to look for a good tree.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
+pub enum Quality {
+    /// Quick to build, slower to ask.
+    Fast,
+    /// What a render of some seconds wants.
+    #[default]
+    Medium,
+    /// Slow to build; for trees that are asked for long.
+    High,
+}
+
+/// Nodes and triangle blocks.
+#[derive(Clone, Debug, Default)]
+pub struct Accel {
+    nodes: Vec<Node>,
+    blocks: Vec<TriangleBlock>,
+    triangles: usize,
+}
+
+/// What a tree is like.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct AccelStats {
+    /// Inner nodes.
+    pub nodes: usize,
+    /// Blocks of triangles.
+    pub blocks: usize,
+    /// Children in use, of eight, on average.
+    pub children_per_node: f64,
+    /// Triangles in use, of eight, on average.
+    pub triangles_per_block: f64,
+    /// Levels of nodes.
+    pub depth: usize,
+    /// Bytes that queries touch.
+    pub bytes: usize,
+    /// Expected nodes and blocks visited by a line through the scene's box, by surface areas.
+    pub expected_visits: f64,
+}
+
+/// Cost of testing the eight boxes of a node and of the eight triangles of a block, relative to each other.
+const NODE_COST: f32 = 1.0;
+const BLOCK_COST: f32 = 1.0;
+
+impl Accel {
+    /// Builds the tree of a scene's triangles; triangle `i` keeps the number `i`.
+    pub fn build(scene: &Scene, quality: Quality) -> Self {
+        let triangles: Vec<[Vec3; 3]> =
+            (0..scene.triangles.len() as u32).map(|i| scene.vertices(i)).collect();
+        Self::from_triangles(&triangles, quality)
+    }
+
+    /// Builds the tree of triangles, which must be finite.
+    pub fn from_triangles(triangles: &[[Vec3; 3]], quality: Quality) -> Self {
+        if triangles.is_empty() {
+            return Self::default();
+        }
+        let binary = build_binary(triangles, quality);
+        let mut cutter = Cutter {
+            plan: plan(&binary),
+            binary: &binary,
+            triangles,
+            nodes: Vec::with_capacity(triangles.len() / 20 + 1),
+            blocks: Vec::with_capacity(triangles.len() / 4 + 1),
+        };
+        cutter.root();
+        let (nodes, blocks) = (cutter.nodes, cutter.blocks);
+        Self { nodes, blocks, triangles: triangles.len() }
+    }
+
+    /// The tree, to ask. Checks it, so ask for it once a render and not once a ray.
+    pub fn bvh(&self) -> Bvh<'_> {
+        Bvh::new(&self.nodes, &self.blocks).expect("the builder keeps the kernel's rules")
+    }
+
+    /// Triangles in the tree.
+    pub fn triangles(&self) -> usize {
+        self.triangles
+    }
+
+    /// Bytes that queries touch: nodes and blocks.
+    pub fn bytes(&self) -> usize {
+        size_of_val(&*self.nodes) + size_of_val(&*self.blocks)
+    }
+
+    /// What the tree is like. Costs one look at every node.
+    pub fn stats(&self) -> AccelStats {
+        let mut stats = AccelStats {
+            nodes: self.nodes.len(),
+            blocks: self.blocks.len(),
+            bytes: self.bytes(),
+            ..Default::default()
+        };
+        if self.nodes.is_empty() {
+            return stats;
+        }
+        let mut depths = vec![1usize; self.nodes.len()];
+        let mut children = 0usize;
+        let mut area = 0.0;
+        let root = bounds_of(self.nodes[0].bounds, |place| self.nodes[0].children[place] != Child::NONE);
+        for (index, node) in self.nodes.iter().enumerate() {
+            stats.depth = stats.depth.max(depths[index]);
+            for place in 0..Node::WIDTH {
+                let child = node.children[place];
+                if child == Child::NONE {
+                    continue;
+                }
+                children += 1;
+                let (lower, upper) = bounds_of(node.bounds, |other| other == place);
+                area += f64::from(half_area(lower, upper));
+                if let Some(below) = child.as_node() {
+                    depths[below] = depths[index] + 1;
+                }
+            }
+        }
+        stats.children_per_node = children as f64 / self.nodes.len() as f64;
+        stats.triangles_per_block = self.triangles as f64 / self.blocks.len().max(1) as f64;
+        let whole = f64::from(half_area(root.0, root.1));
+        stats.expected_visits = 1.0 + if whole > 0.0 { area / whole } else { 0.0 };
+        stats
+    }
+}
+
+fn bounds_of(bounds: [[[f32; 8]; 3]; 2], used: impl Fn(usize) -> bool) -> (Vec3, Vec3) {
+    (0..Node::WIDTH).filter(|&place| used(place)).fold(
+        (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY)),
+        |(lower, upper), place| {
+            let corner = |side: usize| Vec3::from(bounds[side].map(|axis| axis[place]));
+            (lower.min(corner(0)), upper.max(corner(1)))
+        },
+    )
+}
+
+fn half_area(lower: Vec3, upper: Vec3) -> f32 {
+    let d = upper - lower;
+    d.x * d.y + d.y * d.z + d.z * d.x
+}
+
+fn build_binary(triangles: &[[Vec3; 3]], quality: Quality) -> Bvh2 {
+    let boxes: Vec<obvhs::aabb::Aabb> = triangles
+        .iter()
+        .map(|[a, b, c]| obvhs::aabb::Aabb::new(a.min(*b).min(*c).into(), a.max(*b).max(*c).into()))
+        .collect();
+    let (distance, depth, reinsertion) = match quality {
+        Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
+        Quality::Medium => (PlocSearchDistance::Medium, 3, 0.05),
+        Quality::High => (PlocSearchDistance::High, 2, 0.5),
+    };
+    let indices = (0..boxes.len() as u32).collect();
+    let mut binary =
+        PlocBuilder::with_capacity(boxes.len()).build(distance, &boxes, indices, SortPrecision::U64, depth);
+    ReinsertionOptimizer::default().run(&mut binary, reinsertion, None);
+    binary.reorder_in_stack_traversal_order();
+    binary
+}
+
+/// The cheapest way to stand for a subtree by at most `i + 1` children of a node, for `i` from 0 to 6.
+#[derive(Clone, Copy)]
+struct Plan {
+    cost: [f32; 7],
+    /// How many of them the left side gets; 0: not split, use one fewer (or, for one, see `leaf`).
+    left: [u8; 7],
+    /// As one child: the left side's share of the eight in a node of its own; 0: a block of triangles.
+    own: u8,
+}
+
+fn plan(binary: &Bvh2) -> Vec<Plan> {
+    let nodes = &binary.nodes;
+    let mut plans = vec![Plan { cost: [0.0; 7], left: [0; 7], own: 0 }; nodes.len()];
+    let mut counts = vec![0u32; nodes.len()];
+    for index in (0..nodes.len()).rev() {
+        let node = &nodes[index];
+        let area = half_area(node.aabb().min.into(), node.aabb().max.into());
+        let block = area * BLOCK_COST;
+        if node.is_leaf() {
+            counts[index] = node.prim_count;
+            plans[index].cost = [block; 7];
+            continue;
+        }
+        let (a, b) = (node.first_index as usize, node.first_index as usize + 1);
+        counts[index] = counts[a] + counts[b];
+        // Both sides together, with `most` children in all.
+        let split = |most: usize| {
+            (1..most)
+                .map(|left| {
+                    let cost = plans[a].cost[left.min(7) - 1] + plans[b].cost[(most - left).min(7) - 1];
+                    (cost, left as u8)
+                })
+                .min_by(|x, y| x.0.total_cmp(&y.0))
+                .unwrap_or((f32::INFINITY, 0))
+        };
+        let mut plan = Plan { cost: [0.0; 7], left: [0; 7], own: 0 };
+        let (below, left) = split(8);
+        let inner = area * NODE_COST + below;
+        if counts[index] as usize <= TriangleBlock::WIDTH && block <= inner {
+            plan.cost[0] = block;
+        } else {
+            (plan.cost[0], plan.own) = (inner, left);
+        }
+        for most in 2..=7 {
+            let (cost, left) = split(most);
+            let fewer = plan.cost[most - 2];
+            (plan.cost[most - 1], plan.left[most - 1]) = if cost < fewer { (cost, left) } else { (fewer, 0) };
+        }
+        plans[index] = plan;
+    }
+    plans
+}
+
+struct Cutter<'a> {
+    plan: Vec<Plan>,
+    binary: &'a Bvh2,
+    triangles: &'a [[Vec3; 3]],
+    nodes: Vec<Node>,
+    blocks: Vec<TriangleBlock>,
+}
+
+impl Cutter<'_> {
+    fn root(&mut self) {
+        // A root that is a block still needs a node above it.
+        if self.binary.nodes[0].is_leaf() || self.plan[0].own == 0 {
+            let (child, lower, upper) = self.block(&self.below(0));
+            let mut node = Node::EMPTY;
+            node.set(0, lower.to_array(), upper.to_array(), child);
+            self.nodes.push(node);
+        } else {
+            self.node(0, 1);
+        }
+    }
+
+    /// Writes the subtree as a node of its own, on this level.
+    fn node(&mut self, subtree: usize, level: usize) -> (Child, Vec3, Vec3) {
+        let left = usize::from(self.plan[subtree].own);
+        let mut parts = Vec::with_capacity(Node::WIDTH);
+        let first = self.binary.nodes[subtree].first_index as usize;
+        self.parts(first, left, &mut parts);
+        self.parts(first + 1, Node::WIDTH - left, &mut parts);
+        self.place(level, parts.len(), |cutter, part| {
+            let subtree = parts[part];
+            if cutter.binary.nodes[subtree].is_leaf() || cutter.plan[subtree].own == 0 {
+                return cutter.block(&cutter.below(subtree));
+            }
+            // A tree that is too lopsided for the kernel's stack is cut evenly from here on.
+            if level + 1 >= MAX_DEPTH - LEVELS_OF_ANY {
+                let below = cutter.below(subtree);
+                return cutter.even(&below, level + 1);
+            }
+            cutter.node(subtree, level + 1)
+        })
+    }
+
+    /// Writes a node whose children `child` writes.
+    fn place(
+        &mut self,
+        level: usize,
+        children: usize,
+        mut child: impl FnMut(&mut Self, usize) -> (Child, Vec3, Vec3),
+    ) -> (Child, Vec3, Vec3) {
+        debug_assert!(level <= MAX_DEPTH && children <= Node::WIDTH);
+        let index = self.nodes.len();
+        self.nodes.push(Node::EMPTY);
+        let (mut lower, mut upper) = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
+        for place in 0..children {
+            let (child, low, high) = child(self, place);
+            self.nodes[index].set(place, low.to_array(), high.to_array(), child);
+            (lower, upper) = (lower.min(low), upper.max(high));
+        }
+        (Child::node(index as u32), lower, upper)
+    }
+
+    /// The subtrees that stand for this one in a node with room for `most`.
+    fn parts(&self, subtree: usize, most: usize, parts: &mut Vec<usize>) {
+        let mut most = most.min(7);
+        let plan = &self.plan[subtree];
+        while most > 1 && plan.left[most - 1] == 0 {
+            most -= 1;
+        }
+        if most == 1 {
+            parts.push(subtree);
+            return;
+        }
+        let left = usize::from(plan.left[most - 1]);
+        let first = self.binary.nodes[subtree].first_index as usize;
+        self.parts(first, left, parts);
+        self.parts(first + 1, most - left, parts);
+    }
+
+    /// The triangles of a subtree, in its order.
+    fn below(&self, subtree: usize) -> Vec<u32> {
+        let mut triangles = Vec::new();
+        let mut stack = vec![subtree];
+        while let Some(index) = stack.pop() {
+            let node = &self.binary.nodes[index];
+            if node.is_leaf() {
+                let first = node.first_index as usize;
+                triangles.extend_from_slice(
+                    &self.binary.primitive_indices[first..first + node.prim_count as usize],
+                );
+            } else {
+                stack.push(node.first_index as usize + 1);
+                stack.push(node.first_index as usize);
+            }
+        }
+        triangles
+    }
+
+    /// Writes triangles as blocks under nodes of even fill.
+    fn even(&mut self, triangles: &[u32], level: usize) -> (Child, Vec3, Vec3) {
+        if triangles.len() <= TriangleBlock::WIDTH {
+            return self.block(triangles);
+        }
+        let share = triangles.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH);
+        let parts: Vec<&[u32]> = triangles.chunks(share).collect();
+        self.place(level, parts.len(), |cutter, part| cutter.even(parts[part], level + 1))
+    }
+
+    fn block(&mut self, triangles: &[u32]) -> (Child, Vec3, Vec3) {
+        let mut block = TriangleBlock::EMPTY;
+        let (mut lower, mut upper) = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
+        for (lane, &triangle) in triangles.iter().enumerate() {
+            let vertices = self.triangles[triangle as usize];
+            block.set(lane, vertices.map(|vertex| vertex.to_array()), triangle);
+            for vertex in vertices {
+                (lower, upper) = (lower.min(vertex), upper.max(vertex));
+            }
+        }
+        self.blocks.push(block);
+        (Child::leaf(self.blocks.len() as u32 - 1), lower, upper)
+    }
+}
+
+/// Levels that suffice for any number of triangles cut evenly: eight to the eleventh is more than an index holds.
+const LEVELS_OF_ANY: usize = 11;

@@ -1,0 +1,331 @@
+//! A tree of boxes over triangles, eight children a node, and the questions asked of it.
+//!
+//! | question | one ray | up to 16 rays | one point, many light samples |
+//! |---|---|---|---|
+//! | is anything there? | [`Bvh::occluded`] | [`Bvh::occluded_packet`] | [`Bvh::occluded_batch`] |
+//! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | |
+//! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | |
+//! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | |
+//!
+//! Every one gives the answer of a loop over all triangles with the test of [`crate::triangle`]: boxes are
+//! widened by a bound on all rounding, of the box test as of the triangle test, so no hit is culled.
+
+mod batch;
+mod packet;
+mod single;
+mod slabs;
+
+pub use batch::Targets;
+pub use packet::HitPacket;
+
+use crate::lanes::{Native, Simd};
+use crate::triangle::{NO_TRIANGLE, TriangleBlock};
+use bytemuck::{Pod, Zeroable};
+use core::fmt;
+use glam::Vec3;
+
+/// An inner node: the boxes of eight children, and what they are.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C, align(32))]
+pub struct Node {
+    /// `bounds[0]` the least, `bounds[1]` the greatest corners: `bounds[side][axis][child]`. An unused child has
+    /// an empty box: infinity below minus infinity.
+    pub bounds: [[[f32; 8]; 3]; 2],
+    /// The children.
+    pub children: [Child; 8],
+}
+
+impl Node {
+    /// Children a node holds.
+    pub const WIDTH: usize = 8;
+
+    /// No children.
+    pub const EMPTY: Self =
+        Self { bounds: [[[f32::INFINITY; 8]; 3], [[f32::NEG_INFINITY; 8]; 3]], children: [Child::NONE; 8] };
+
+    /// Writes a child. Panics if there is no such place.
+    pub fn set(&mut self, place: usize, lower: [f32; 3], upper: [f32; 3], child: Child) {
+        for axis in 0..3 {
+            self.bounds[0][axis][place] = lower[axis];
+            self.bounds[1][axis][place] = upper[axis];
+        }
+        self.children[place] = child;
+    }
+}
+
+/// What a place of a [`Node`] refers to: another node, a block of triangles, or nothing.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
+#[repr(transparent)]
+pub struct Child(u32);
+
+impl Child {
+    const LEAF: u32 = 1 << 31;
+
+    /// Nothing.
+    pub const NONE: Self = Self(u32::MAX);
+
+    /// The greatest index that fits.
+    pub const MAX_INDEX: u32 = Self::LEAF - 2;
+
+    /// An inner node, by its index.
+    #[inline(always)]
+    pub const fn node(index: u32) -> Self {
+        Self(index)
+    }
+
+    /// A block of triangles, by its index.
+    #[inline(always)]
+    pub const fn leaf(index: u32) -> Self {
+        Self(index | Self::LEAF)
+    }
+
+    /// The index of the inner node it refers to, if it does.
+    #[inline]
+    pub const fn as_node(self) -> Option<usize> {
+        if self.is_leaf() { None } else { Some(self.index()) }
+    }
+
+    /// The index of the block it refers to, if it does.
+    #[inline]
+    pub const fn as_leaf(self) -> Option<usize> {
+        if self.is_leaf() && self.0 != Self::NONE.0 { Some(self.index()) } else { None }
+    }
+
+    #[inline(always)]
+    const fn is_leaf(self) -> bool {
+        self.0 & Self::LEAF != 0
+    }
+
+    #[inline(always)]
+    const fn index(self) -> usize {
+        (self.0 & !Self::LEAF) as usize
+    }
+}
+
+/// Why slices are no tree. Every variant names the node or block at fault.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+#[non_exhaustive]
+pub enum BvhError {
+    /// A child's index lies beyond the slice.
+    OutOfRange {
+        /// The node.
+        node: u32,
+        /// The child's place in it.
+        place: u32,
+    },
+    /// A node refers to itself or to one before it. Children come after their parents.
+    Backwards {
+        /// The node.
+        node: u32,
+        /// The child's place in it.
+        place: u32,
+    },
+    /// A box is NaN, infinite or inside out though the place is used.
+    Box {
+        /// The node.
+        node: u32,
+        /// The child's place in it.
+        place: u32,
+    },
+    /// More than [`MAX_DEPTH`] levels.
+    TooDeep {
+        /// A node on the lowest level allowed.
+        node: u32,
+    },
+    /// Two places refer to the same node, so this is no tree.
+    Shared {
+        /// A node met when all were counted already.
+        node: u32,
+    },
+    /// A used lane of a block holds a vertex that is NaN or infinite.
+    Vertex {
+        /// The block.
+        block: u32,
+        /// The lane.
+        lane: u32,
+    },
+    /// More nodes or blocks than an index can name.
+    TooMany,
+}
+
+impl fmt::Display for BvhError {
+    fn fmt(&self, f: &mut fmt::Formatter<'_>) -> fmt::Result {
+        match self {
+            Self::OutOfRange { node, place } => {
+                write!(f, "node {node}, child {place}: index beyond the slice")
+            }
+            Self::Backwards { node, place } => {
+                write!(f, "node {node}, child {place}: refers to a node that is not behind it")
+            }
+            Self::Box { node, place } => write!(f, "node {node}, child {place}: not a finite box"),
+            Self::TooDeep { node } => write!(f, "node {node}: deeper than {} levels", MAX_DEPTH),
+            Self::Shared { node } => write!(f, "node {node}: has more than one parent"),
+            Self::Vertex { block, lane } => write!(f, "block {block}, lane {lane}: a vertex is not finite"),
+            Self::TooMany => write!(f, "more than {} nodes or blocks", Child::MAX_INDEX),
+        }
+    }
+}
+
+impl core::error::Error for BvhError {}
+
+/// A tree over borrowed slices, checked once; after that no query can fail, overflow or run for ever.
+///
+/// `S` says which vectors the queries use; [`Bvh::on`] changes it. Copying one copies two slices.
+#[derive(Clone, Copy, Debug)]
+pub struct Bvh<'a, S = Native> {
+    nodes: &'a [Node],
+    blocks: &'a [TriangleBlock],
+    magnitude: f32,
+    simd: S,
+}
+
+/// Levels of nodes a tree may have.
+pub const MAX_DEPTH: usize = 32;
+
+/// What a stack of nodes yet to visit must hold: each level leaves up to seven behind.
+const STACK: usize = MAX_DEPTH * (Node::WIDTH - 1) + 1;
+
+/// One unit in the last place of 1, halved: how far rounding moves a number, relative to it.
+const ROUNDING: f32 = f32::EPSILON / 2.0;
+
+impl<'a> Bvh<'a> {
+    /// A tree whose root is the first node; no nodes make an empty scene.
+    ///
+    /// Checked: indices, order (children come after their parents), depth, boxes and vertices. Not checked: that
+    /// a box holds what is below it; triangles outside their boxes are not found. Costs one look at everything.
+    pub fn new(nodes: &'a [Node], blocks: &'a [TriangleBlock]) -> Result<Self, BvhError> {
+        check(nodes, blocks)?;
+        let magnitude = nodes.first().map_or(0.0, |root| {
+            let used = |place: &usize| root.children[*place] != Child::NONE;
+            (0..Node::WIDTH).filter(used).fold(0.0f32, |most, place| {
+                root.bounds.iter().flatten().fold(most, |most, axis| most.max(axis[place].abs()))
+            })
+        });
+        Ok(Self { nodes, blocks, magnitude, simd: Native })
+    }
+}
+
+impl<'a, S: Simd> Bvh<'a, S> {
+    /// The same tree, asked with other vectors.
+    #[inline(always)]
+    pub fn on<T: Simd>(&self, simd: T) -> Bvh<'a, T> {
+        Bvh { nodes: self.nodes, blocks: self.blocks, magnitude: self.magnitude, simd }
+    }
+
+    /// The nodes.
+    #[inline]
+    pub fn nodes(&self) -> &'a [Node] {
+        self.nodes
+    }
+
+    /// The triangles.
+    #[inline]
+    pub fn blocks(&self) -> &'a [TriangleBlock] {
+        self.blocks
+    }
+
+    /// How far a point must stand off a surface so that no rounding makes it hit that surface, or one in the
+    /// same plane: 16 roundings of the scene's greatest coordinate. For [`offset`].
+    ///
+    /// It covers the error of a point computed on a triangle and the error of the triangle test (see
+    /// [`crate::triangle`]; each sheared vertex is off by up to four roundings of its distance from the origin,
+    /// which two points of the scene bound by twice the greatest coordinate).
+    #[inline]
+    pub fn clearance(&self) -> f32 {
+        16.0 * ROUNDING * self.magnitude
+    }
+
+    /// What bounds are widened by, for a ray from here: all rounding of box and triangle tests.
+    #[inline(always)]
+    fn slack(&self, origin: Vec3) -> f32 {
+        16.0 * ROUNDING * (self.magnitude + origin.abs().max_element())
+    }
+}
+
+/// Moves a point off a surface, along its unit normal, to the side the normal points to.
+///
+/// With [`Bvh::clearance`], a ray that leaves to that side cannot hit the surface or another in its plane, and
+/// one that enters meets it; there is no epsilon to tune, since the distance follows from the scene's numbers.
+/// Move both ends of a shadow ray: x along the normal of its surface, y along the light's.
+///
+/// After Wächter and Binder, "A Fast and Robust Method for Avoiding Self-Intersection" (Ray Tracing Gems,
+/// 2019), who offset by units in the last place of the point; here the unit is that of the whole scene, since
+/// the planes that must be cleared may be spanned by vertices far from the point.
+#[inline]
+pub fn offset(point: impl Into<[f32; 3]>, normal: impl Into<[f32; 3]>, clearance: f32) -> Vec3 {
+    Vec3::from(point.into()) + Vec3::from(normal.into()) * clearance
+}
+
+fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
+    if nodes.len().max(blocks.len()) > Child::MAX_INDEX as usize {
+        return Err(BvhError::TooMany);
+    }
+    for (index, block) in blocks.iter().enumerate() {
+        for lane in 0..TriangleBlock::WIDTH {
+            let finite = block.vertices.iter().flatten().all(|axis| axis[lane].is_finite());
+            if !finite {
+                return Err(BvhError::Vertex { block: index as u32, lane: lane as u32 });
+            }
+        }
+    }
+    for (index, node) in nodes.iter().enumerate() {
+        for place in 0..Node::WIDTH {
+            let child = node.children[place];
+            if child == Child::NONE {
+                continue;
+            }
+            let at = (index as u32, place as u32);
+            let there = if child.is_leaf() { blocks.len() } else { nodes.len() };
+            if child.index() >= there {
+                return Err(BvhError::OutOfRange { node: at.0, place: at.1 });
+            }
+            if !child.is_leaf() && child.index() <= index {
+                return Err(BvhError::Backwards { node: at.0, place: at.1 });
+            }
+            let sound = (0..3).all(|axis| {
+                let (lower, upper) = (node.bounds[0][axis][place], node.bounds[1][axis][place]);
+                lower.is_finite() && upper.is_finite() && lower <= upper
+            });
+            if !sound {
+                return Err(BvhError::Box { node: at.0, place: at.1 });
+            }
+        }
+    }
+    if nodes.is_empty() {
+        return Ok(());
+    }
+    // Depth first, a frame a level: the node and the next of its places. Indices only grow on the way down, and
+    // more visits than nodes mean that one has two parents, so this ends.
+    let mut path = [(0usize, 0usize); MAX_DEPTH];
+    let (mut level, mut visits) = (0, 1);
+    loop {
+        let (index, place) = path[level];
+        if place == Node::WIDTH {
+            if level == 0 {
+                return Ok(());
+            }
+            level -= 1;
+            continue;
+        }
+        path[level].1 += 1;
+        let child = nodes[index].children[place];
+        if child == Child::NONE || child.is_leaf() {
+            continue;
+        }
+        visits += 1;
+        if visits > nodes.len() {
+            return Err(BvhError::Shared { node: child.0 });
+        }
+        level += 1;
+        if level == MAX_DEPTH {
+            return Err(BvhError::TooDeep { node: index as u32 });
+        }
+        path[level] = (child.index(), 0);
+    }
+}
+
+/// Does a hit on this triangle count?
+#[inline(always)]
+fn counts(id: u32, ignore: Option<u32>) -> bool {
+    id != ignore.unwrap_or(NO_TRIANGLE)
+}

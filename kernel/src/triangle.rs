@@ -1,0 +1,250 @@
+//! Ray and triangle: does the segment meet it?
+//!
+//! The test of Woop, Benthin and Wald, "Watertight Ray/Triangle Intersection" (JCGT 2013). The ray's dominant
+//! axis becomes z, a shear makes the ray the z axis, and what is left is a point-in-triangle test in the plane:
+//! with the sheared vertices A, B and C,
+//!
+//! ```text
+//!     U = Cx By - Cy Bx,    V = Ax Cy - Ay Cx,    W = Bx Ay - By Ax,    all >= 0 or all <= 0.
+//! ```
+//!
+//! **Guarantee.** A line through a shared edge or vertex of a closed mesh meets at least one of the triangles
+//! around it. A vertex is sheared by the same operations in every triangle, so all of them see the same point of
+//! the plane. `U` is the difference of two rounded products; rounding is monotonic, so the difference may come
+//! out as zero but never with the wrong sign, and zero counts as inside. The set of triangles that answer is thus
+//! no smaller than the set that holds the origin exactly. The two products must each be rounded: a fused
+//! multiply-add would break this, and nothing here uses one. (The original falls back to double precision when
+//! an edge function is zero; counting zero as inside makes that unnecessary.) A triangle seen exactly edge-on
+//! (`U = V = W = 0`) is missed; its neighbours share the edges and answer in its place.
+//!
+//! All of it is single operations in a fixed order, so every width gives the same answer bit for bit.
+
+use crate::lanes::{Lanes, Mask, Simd};
+use bytemuck::{Pod, Zeroable};
+use glam::Vec3;
+
+/// Marks an unused lane of a [`TriangleBlock`]. No triangle may have this number.
+pub const NO_TRIANGLE: u32 = u32::MAX;
+
+/// Up to eight triangles side by side: what a leaf of a [`Bvh`](crate::Bvh) holds.
+///
+/// Unused lanes hold a point, which nothing hits, and the number [`NO_TRIANGLE`]; used lanes come first.
+#[derive(Clone, Copy, Debug, PartialEq, Pod, Zeroable)]
+#[repr(C, align(32))]
+pub struct TriangleBlock {
+    /// `vertices[vertex][axis][lane]`.
+    pub vertices: [[[f32; 8]; 3]; 3],
+    /// The number of the triangle in each lane.
+    pub ids: [u32; 8],
+}
+
+impl TriangleBlock {
+    /// Triangles a block holds.
+    pub const WIDTH: usize = 8;
+
+    /// No triangles.
+    pub const EMPTY: Self = Self { vertices: [[[0.0; 8]; 3]; 3], ids: [NO_TRIANGLE; 8] };
+
+    /// Writes the triangle of a lane. Panics if there is no such lane.
+    pub fn set(&mut self, lane: usize, vertices: [[f32; 3]; 3], id: u32) {
+        for (vertex, position) in vertices.iter().enumerate() {
+            for (axis, &value) in position.iter().enumerate() {
+                self.vertices[vertex][axis][lane] = value;
+            }
+        }
+        self.ids[lane] = id;
+    }
+
+    /// The vertices of a lane. Panics if there is no such lane.
+    #[inline]
+    pub fn get(&self, lane: usize) -> [[f32; 3]; 3] {
+        self.vertices.map(|vertex| vertex.map(|axis| axis[lane]))
+    }
+
+    /// Triangles in use.
+    #[inline]
+    pub fn len(&self) -> usize {
+        self.ids.iter().take_while(|&&id| id != NO_TRIANGLE).count()
+    }
+
+    /// Is no lane in use?
+    #[inline]
+    pub fn is_empty(&self) -> bool {
+        self.ids[0] == NO_TRIANGLE
+    }
+}
+
+/// The axes of a ray: the dominant one last.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub(crate) struct Axes {
+    pub(crate) x: usize,
+    pub(crate) y: usize,
+    pub(crate) z: usize,
+}
+
+impl Axes {
+    /// With this dominant axis.
+    #[inline(always)]
+    pub(crate) fn of(z: usize) -> Self {
+        // Written so that the compiler sees that none is above 2.
+        match z {
+            0 => Self { x: 1, y: 2, z: 0 },
+            1 => Self { x: 2, y: 0, z: 1 },
+            _ => Self { x: 0, y: 1, z: 2 },
+        }
+    }
+
+    /// The axis along which a direction is longest; the first of several.
+    #[inline(always)]
+    pub(crate) fn dominant(direction: Vec3) -> usize {
+        let length = direction.abs();
+        if length.x >= length.y && length.x >= length.z {
+            0
+        } else if length.y >= length.z {
+            1
+        } else {
+            2
+        }
+    }
+}
+
+/// A ray as the triangle test wants it, one a lane, all with the same dominant axis.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sheared<L> {
+    pub(crate) axes: Axes,
+    /// The origin, by world axis.
+    pub(crate) origin: [L; 3],
+    /// How x and y move for a step along z, and how far t does.
+    pub(crate) shear: [L; 3],
+    pub(crate) t_min: L,
+    pub(crate) t_max: L,
+}
+
+/// What the test leaves behind: who was hit, and `t`, `u` and `v` scaled by the determinant.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Crossing<L: Lanes> {
+    pub(crate) hit: L::Mask,
+    pub(crate) det: L,
+    pub(crate) t: L,
+    pub(crate) u: L,
+    pub(crate) v: L,
+}
+
+impl<L: Lanes> Sheared<L> {
+    /// A ray, or one a lane. `direction` must be longest along `axes.z` in every lane that counts.
+    #[inline(always)]
+    pub(crate) fn new(
+        token: L::Token,
+        axes: Axes,
+        origin: [L; 3],
+        direction: [L; 3],
+        t_min: L,
+        t_max: L,
+    ) -> Self {
+        let z = direction[axes.z];
+        let shear = [direction[axes.x] / z, direction[axes.y] / z, L::splat(token, 1.0) / z];
+        Self { axes, origin, shear, t_min, t_max }
+    }
+
+    /// A vertex with the ray's origin at 0 and the ray along z.
+    #[inline(always)]
+    fn vertex(&self, vertex: [L; 3]) -> [L; 3] {
+        let Axes { x, y, z } = self.axes;
+        let depth = vertex[z] - self.origin[z];
+        [
+            (vertex[x] - self.origin[x]) - self.shear[0] * depth,
+            (vertex[y] - self.origin[y]) - self.shear[1] * depth,
+            depth,
+        ]
+    }
+
+    /// Where these rays meet these triangles, lane by lane; either side may be splatted. NaN is a miss.
+    #[inline(always)]
+    pub(crate) fn cross(&self, token: L::Token, triangle: [[L; 3]; 3]) -> Crossing<L> {
+        let [a, b, c] = triangle.map(|vertex| self.vertex(vertex));
+        let u = c[0] * b[1] - c[1] * b[0];
+        let v = a[0] * c[1] - a[1] * c[0];
+        let w = b[0] * a[1] - b[1] * a[0];
+        let det = u + v + w;
+        // Weights of one sign: no cancellation in `det`, and t lies between the vertices' depths.
+        let t = self.shear[2] * (u * a[2] + v * b[2] + w * c[2]);
+
+        let zero = L::splat(token, 0.0);
+        let (first, last) = (self.t_min * det, self.t_max * det);
+        let front = zero.le(u) & zero.le(v) & zero.le(w) & first.lt(t) & t.le(last);
+        let back = u.le(zero) & v.le(zero) & w.le(zero) & t.lt(first) & last.le(t);
+        // With a determinant of zero t is zero too, and neither strict comparison holds.
+        Crossing { hit: front | back, det, t, u: v, v: w }
+    }
+}
+
+impl<S> Sheared<S>
+where
+    S: Lanes,
+{
+    /// One ray against the eight triangles of a block: the lanes hit, as bits, and the crossings as arrays.
+    #[inline(always)]
+    pub(crate) fn cross_block(&self, token: S::Token, block: &TriangleBlock, found: &mut Found) -> u32 {
+        let mut hits = 0;
+        for from in (0..TriangleBlock::WIDTH).step_by(S::WIDTH) {
+            let triangle = block
+                .vertices
+                .each_ref()
+                .map(|vertex| vertex.each_ref().map(|axis| S::load(token, &axis[from..])));
+            let crossing = self.cross(token, triangle);
+            let bits = crossing.hit.bits();
+            if bits != 0 {
+                crossing.det.store(&mut found.det[from..]);
+                crossing.t.store(&mut found.t[from..]);
+                crossing.u.store(&mut found.u[from..]);
+                crossing.v.store(&mut found.v[from..]);
+                hits |= bits << from;
+            }
+        }
+        hits
+    }
+}
+
+/// Crossings as arrays; a lane counts where the test's bit is set.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Found {
+    pub(crate) det: [f32; 16],
+    pub(crate) t: [f32; 16],
+    pub(crate) u: [f32; 16],
+    pub(crate) v: [f32; 16],
+}
+
+impl Found {
+    pub(crate) const NOTHING: Self = Self { det: [0.0; 16], t: [0.0; 16], u: [0.0; 16], v: [0.0; 16] };
+
+    /// The hit of a lane.
+    #[inline(always)]
+    pub(crate) fn hit(&self, lane: usize, triangle: u32) -> crate::Hit {
+        let det = self.det[lane];
+        crate::Hit { t: self.t[lane] / det, u: self.u[lane] / det, v: self.v[lane] / det, triangle }
+    }
+}
+
+/// The dominant axis of a ray that can hit something; `None` for one that cannot.
+#[inline(always)]
+pub(crate) fn dominant_axis(origin: Vec3, direction: Vec3) -> Option<usize> {
+    let longest = direction.abs().max_element();
+    (origin.is_finite() && direction.is_finite() && longest > 0.0).then(|| Axes::dominant(direction))
+}
+
+/// One ray, the same in every lane.
+#[inline(always)]
+pub(crate) fn shear_one<S: Simd>(simd: S, ray: &crate::Ray, axis: usize) -> Sheared<S::Node> {
+    let token = simd.token();
+    let splat = |value: f32| S::Node::splat(token, value);
+    // Divided once as scalars: the same division as in any lane.
+    let axes = Axes::of(axis);
+    let z = ray.direction[axes.z];
+    Sheared {
+        axes,
+        origin: ray.origin.to_array().map(splat),
+        shear: [splat(ray.direction[axes.x] / z), splat(ray.direction[axes.y] / z), splat(1.0 / z)],
+        t_min: splat(ray.t_min),
+        t_max: splat(ray.t_max),
+    }
+}
