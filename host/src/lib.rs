@@ -2,6 +2,8 @@
 
 pub mod accel;
 pub mod error;
+pub mod light;
+pub mod sampler;
 pub mod scene;
 
 pub use error::{Error, Result};

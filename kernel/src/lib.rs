@@ -27,6 +27,7 @@
 pub mod bvh;
 pub mod counter;
 pub mod lanes;
+pub mod polygon;
 pub mod ray;
 pub mod triangle;
 
