@@ -1,1 +1,7 @@
-fn main() {}
+//! The command `occlude`: see `occlude_host::cli`.
+
+use std::process::ExitCode;
+
+fn main() -> ExitCode {
+    occlude_host::cli::run()
+}

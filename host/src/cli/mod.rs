@@ -1,0 +1,93 @@
+//! The command `occlude`.
+
+pub mod compare;
+pub mod generate;
+pub mod info;
+pub mod render;
+
+use crate::error::{Error, Result};
+use clap::{Parser, Subcommand};
+use occlude_kernel::lanes::{Level, detect, level_name, level_named, levels};
+use std::io::Write;
+use std::process::ExitCode;
+
+/// Soft shadows from area lights.
+#[derive(Debug, Parser)]
+#[command(name = "occlude", version, about, max_term_width = 100, propagate_version = true)]
+pub struct Cli {
+    /// Use this SIMD level and not the best one of the CPU (`occlude info` lists them).
+    #[arg(long, global = true, value_name = "LEVEL", value_parser = simd_level)]
+    simd: Option<SimdLevel>,
+
+    #[command(subcommand)]
+    command: Command,
+}
+
+#[derive(Debug, Subcommand)]
+enum Command {
+    /// Render a scene's direct light.
+    Render(render::RenderArgs),
+    /// Say what a scene holds, and what this machine can do.
+    Info(info::InfoArgs),
+    /// Compare two images: error, bias, FLIP.
+    Compare(compare::CompareArgs),
+    /// Write a scene of any size.
+    Generate(generate::GenerateArgs),
+}
+
+/// A SIMD level of this CPU.
+#[derive(Clone, Copy, Debug)]
+pub struct SimdLevel(Level);
+
+fn simd_level(name: &str) -> std::result::Result<SimdLevel, String> {
+    level_named(name).map(SimdLevel).ok_or_else(|| {
+        let known: Vec<&str> = levels().map(level_name).collect();
+        format!("this CPU has {}", known.join(", "))
+    })
+}
+
+/// How a command ended.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Ended {
+    /// As asked.
+    Done,
+    /// By Ctrl-C; what there was has been written.
+    Interrupted,
+}
+
+/// Runs the command line: 0 when done, 1 when interrupted, 2 when something was wrong.
+pub fn run() -> ExitCode {
+    let cli = Cli::parse();
+    let level = cli.simd.map_or_else(detect, |level| level.0);
+    let ended = match &cli.command {
+        Command::Render(args) => render::run(args, level),
+        Command::Info(args) => info::run(args, level).map(|()| Ended::Done),
+        Command::Compare(args) => compare::run(args).map(|()| Ended::Done),
+        Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
+    };
+    match ended {
+        Ok(Ended::Done) => ExitCode::SUCCESS,
+        Ok(Ended::Interrupted) => ExitCode::from(1),
+        Err(error) => {
+            // Standard error may be closed as well; there is nobody left to tell.
+            let _ = writeln!(std::io::stderr(), "error: {error}");
+            ExitCode::from(2)
+        }
+    }
+}
+
+/// Prints to standard output. A reader that has gone away is no error: `occlude info | head`.
+pub fn print(text: &str) -> Result<()> {
+    let mut out = std::io::stdout().lock();
+    match out.write_all(text.as_bytes()).and_then(|()| out.flush()) {
+        Err(error) if error.kind() != std::io::ErrorKind::BrokenPipe => {
+            Err(Error::io("writing to", "standard output")(error))
+        }
+        _ => Ok(()),
+    }
+}
+
+/// Prints a line to standard error, if anybody listens.
+pub fn note(text: &str) {
+    let _ = writeln!(std::io::stderr(), "{text}");
+}

@@ -1,0 +1,339 @@
+//! `occlude render`.
+
+use super::{Ended, note};
+use crate::accel::{Accel, Quality};
+use crate::error::{Error, Result};
+use crate::integrator::{Exact, Stage, Visibility};
+use crate::render::{Limits, render};
+use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
+use crate::sampler::Pattern;
+use crate::scene::CameraRequest;
+use crate::{light, metrics, output, scene};
+use clap::{Args, ValueEnum};
+use glam::Vec3;
+use indicatif::{ProgressBar, ProgressStyle};
+use occlude_kernel::lanes::{Level, level_name};
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
+use std::time::{Duration, Instant};
+
+/// Arguments of `occlude render`.
+#[derive(Debug, Args)]
+pub struct RenderArgs {
+    /// A folder with scene.obj (or exactly one .obj), or an .obj file.
+    scene: PathBuf,
+
+    /// Where to write the image: .png (sRGB), .exr (float, with a variance layer), .hdr or .pfm. May be given
+    /// several times. Without it, NAME.png in the current folder.
+    #[arg(short, long, value_name = "FILE")]
+    output: Vec<PathBuf>,
+
+    /// Camera samples a pixel, one a pass.
+    #[arg(long, default_value_t = 16, value_name = "P", value_parser = clap::value_parser!(u32).range(1..))]
+    spp: u32,
+
+    /// Shadow rays a camera sample, over all lights together.
+    #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    shadow_rays: u32,
+
+    /// How visibility is found.
+    #[arg(long, value_enum, default_value_t)]
+    method: Method,
+
+    /// How the shadow rays are spread over a light.
+    #[arg(long, value_enum, default_value_t)]
+    pattern: Pattern,
+
+    /// How long to look for a good tree.
+    #[arg(long, value_enum, default_value_t)]
+    quality: Quality,
+
+    /// Threads; 0 for one a core. The image is the same for any number.
+    #[arg(long, default_value_t = 0, value_name = "T")]
+    threads: usize,
+
+    /// Seed of the random numbers.
+    #[arg(long, default_value_t = 0, value_name = "S")]
+    seed: u64,
+
+    /// Begin no pass after this many seconds of rendering.
+    #[arg(long, value_name = "SECONDS", value_parser = seconds)]
+    time_limit: Option<Duration>,
+
+    /// Brightness of .png files, in stops.
+    #[arg(long, default_value_t = 0.0, value_name = "EV", allow_negative_numbers = true, value_parser = finite)]
+    exposure: f32,
+
+    /// Compare the result with this image (.exr, .hdr or .pfm).
+    #[arg(long, value_name = "FILE")]
+    reference: Option<PathBuf>,
+
+    /// Write times, counts, memory and error as JSON. Counting slows the render a little.
+    #[arg(long, value_name = "FILE")]
+    stats: Option<PathBuf>,
+
+    /// Print nothing but errors.
+    #[arg(short, long)]
+    quiet: bool,
+
+    #[command(flatten)]
+    camera: CameraArgs,
+}
+
+/// The camera's options, which `info` and `render` share.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Camera")]
+pub struct CameraArgs {
+    /// Image size in pixels.
+    #[arg(long, value_name = "WxH", value_parser = size)]
+    size: Option<(u32, u32)>,
+
+    /// A camera file, and not the camera.json beside the scene.
+    #[arg(long, value_name = "FILE")]
+    camera: Option<PathBuf>,
+
+    /// Where the camera is.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = vector)]
+    eye: Option<Vec3>,
+
+    /// The point in the middle of the image.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = vector)]
+    target: Option<Vec3>,
+
+    /// Which way is up.
+    #[arg(long, value_name = "X,Y,Z", allow_hyphen_values = true, value_parser = vector)]
+    up: Option<Vec3>,
+
+    /// The vertical angle of view in degrees.
+    #[arg(long, value_name = "DEGREES", value_parser = finite)]
+    vfov: Option<f32>,
+}
+
+impl CameraArgs {
+    /// The same for [`scene::load`].
+    pub fn request(&self) -> CameraRequest {
+        CameraRequest {
+            file: self.camera.clone(),
+            eye: self.eye,
+            target: self.target,
+            up: self.up,
+            vfov_deg: self.vfov,
+            size: self.size,
+        }
+    }
+}
+
+/// How visibility is found.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
+enum Method {
+    /// Every shadow ray is traced through the scene.
+    #[default]
+    Exact,
+}
+
+impl Method {
+    fn visibility(self) -> Box<dyn Visibility> {
+        match self {
+            Self::Exact => Box::new(Exact),
+        }
+    }
+}
+
+fn finite(text: &str) -> std::result::Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if value.is_finite() { Ok(value) } else { Err("must be finite".to_owned()) }
+}
+
+fn seconds(text: &str) -> std::result::Result<Duration, String> {
+    let value: f64 = text.parse().map_err(|_| "not a number of seconds".to_owned())?;
+    Duration::try_from_secs_f64(value).map_err(|_| "must be a time from 0 on, in seconds".to_owned())
+}
+
+fn vector(text: &str) -> std::result::Result<Vec3, String> {
+    let parts = text.split(',').map(|part| finite(part.trim())).collect::<std::result::Result<Vec<f32>, _>>();
+    match parts.as_deref() {
+        Ok(&[x, y, z]) => Ok(Vec3::new(x, y, z)),
+        _ => Err("wants three numbers with commas between, like 0,1.5,-3".to_owned()),
+    }
+}
+
+fn size(text: &str) -> std::result::Result<(u32, u32), String> {
+    text.split_once(['x', 'X'])
+        .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)))
+        .ok_or_else(|| "wants width x height in pixels, like 1280x720".to_owned())
+}
+
+/// Runs the command.
+pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
+    for path in args.output.iter().chain(&args.stats) {
+        output::check_folder(path)?;
+    }
+    for path in &args.output {
+        output::check_writable(path)?;
+    }
+    let reference = args.reference.as_ref().map(output::read).transpose()?;
+
+    let start = Instant::now();
+    let scene = scene::load(&args.scene, &args.camera.request())?;
+    let load = start.elapsed();
+    if !args.quiet {
+        scene.warnings.iter().for_each(|warning| note(&format!("warning: {warning}")));
+    }
+    let camera = scene.camera.ok_or_else(|| Error::input(&args.scene, "has no camera"))?;
+    let size = (camera.width, camera.height);
+    if let Some(reference) = &reference {
+        let has = (reference.width, reference.height);
+        if has != size {
+            return Err(Error::Usage(format!(
+                "the reference is {}x{} but the image is {}x{}: give --size {}x{}, or another reference",
+                has.0, has.1, size.0, size.1, has.0, has.1
+            )));
+        }
+    }
+    let outputs =
+        if args.output.is_empty() { vec![PathBuf::from(format!("{}.png", scene.name))] } else { args.output.clone() };
+    for path in &outputs {
+        output::check_writable(path)?;
+    }
+
+    let start = Instant::now();
+    let accel = Accel::build(&scene, args.quality);
+    let build = start.elapsed();
+    let lights = light::lights(&scene);
+    let frame = camera.frame();
+    let stage = Stage {
+        scene: &scene,
+        bvh: accel.bvh(),
+        lights: &lights,
+        camera: &frame,
+        shadow_rays: args.shadow_rays,
+        pattern: args.pattern,
+        seed: args.seed,
+        level,
+        count: args.stats.is_some(),
+    };
+
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    // A second Ctrl-C does not wait.
+    let handled = ctrlc::set_handler(move || {
+        if asked.swap(true, Ordering::Relaxed) {
+            std::process::exit(1);
+        }
+    });
+    if let Err(error) = handled {
+        note(&format!("warning: Ctrl-C will lose the picture: {error}"));
+    }
+
+    let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
+    let limits = Limits { passes: args.spp, time: args.time_limit };
+    let method = args.method.visibility();
+    let rendered = render(&stage, &*method, size, limits, args.threads, &stop, |pass| progress.passed(pass))?;
+    progress.finish();
+
+    let image = rendered.film.develop();
+    let variance = rendered.film.variance_of_mean();
+    for path in &outputs {
+        output::write(path, &image, Some(&variance), args.exposure)?;
+    }
+    let error = reference
+        .map(|reference| metrics::compare(&image, &reference))
+        .transpose()?
+        .map(|c| ErrorFigures { rmse: c.rmse, relmse: c.relmse, mean_ratio: c.mean_ratio_overall });
+    let seconds = |time: Duration| time.as_secs_f64();
+    let report = Report {
+        scene: scene.name.clone(),
+        method: args.method.to_possible_value().map(|v| v.get_name().to_owned()).unwrap_or_default(),
+        size: [size.0, size.1],
+        spp: rendered.passes,
+        shadow_rays: args.shadow_rays,
+        threads: if args.threads == 0 { rayon::current_num_threads() } else { args.threads },
+        seed: args.seed,
+        simd: level_name(level).to_owned(),
+        interrupted: rendered.interrupted,
+        time: Times {
+            load_s: seconds(load),
+            build_s: seconds(build),
+            preprocess_s: 0.0,
+            render_s: seconds(rendered.elapsed),
+            camera_s: seconds(rendered.times.camera),
+            light_s: seconds(rendered.times.light),
+            visibility_s: seconds(rendered.times.visibility),
+            shade_s: seconds(rendered.times.shade),
+        },
+        counts: WorkCounts {
+            camera_rays: rendered.camera_counts.rays,
+            shadow_rays: rendered.shadow_counts.rays,
+            triangle_tests: rendered.shadow_counts.triangle_tests,
+            node_tests: rendered.shadow_counts.node_tests,
+            camera_triangle_tests: rendered.camera_counts.triangle_tests,
+            camera_node_tests: rendered.camera_counts.node_tests,
+        },
+        memory: Memory {
+            bvh_bytes: accel.bytes(),
+            bvh_bytes_per_triangle: accel.bytes() as f64 / accel.triangles().max(1) as f64,
+            triangles: accel.triangles(),
+        },
+        error,
+    };
+    if let Some(path) = &args.stats {
+        report.write(path)?;
+    }
+    if !args.quiet {
+        let written: Vec<String> = outputs.iter().map(|path| path.display().to_string()).collect();
+        note(report.summary().trim_end());
+        if rendered.interrupted {
+            note(&format!("interrupted after {} of {} passes", rendered.passes, args.spp));
+        }
+        note(&format!("wrote {}", written.join(", ")));
+    }
+    Ok(if rendered.interrupted { Ended::Interrupted } else { Ended::Done })
+}
+
+/// A bar on a terminal, a line a pass in a pipe.
+enum Progress {
+    Quiet,
+    Bar(ProgressBar, u64),
+    Lines { passes: u32, start: Instant },
+}
+
+impl Progress {
+    fn new(quiet: bool, passes: u32, pixels: u64) -> Self {
+        if quiet {
+            return Self::Quiet;
+        }
+        if !std::io::stderr().is_terminal() {
+            return Self::Lines { passes, start: Instant::now() };
+        }
+        let bar = ProgressBar::new(u64::from(passes) * pixels);
+        let template = "{bar:30} {percent:>3}%  {per_sec} paths, {eta} left";
+        if let Ok(style) = ProgressStyle::with_template(template) {
+            let rate = |state: &indicatif::ProgressState, out: &mut dyn std::fmt::Write| {
+                let _ = write!(out, "{:.2} M/s", state.per_sec() * 1e-6);
+            };
+            bar.set_style(style.with_key("per_sec", rate));
+        }
+        bar.enable_steady_tick(Duration::from_millis(200));
+        Self::Bar(bar, pixels)
+    }
+
+    fn passed(&self, pass: u32) {
+        match self {
+            Self::Quiet => {}
+            Self::Bar(bar, pixels) => bar.set_position(u64::from(pass) * pixels),
+            Self::Lines { passes, start } => {
+                let spent = start.elapsed().as_secs_f64();
+                let left = spent / f64::from(pass) * f64::from(passes - pass);
+                note(&format!("pass {pass} of {passes}, {spent:.1} s, {left:.1} s left"));
+            }
+        }
+    }
+
+    fn finish(&self) {
+        if let Self::Bar(bar, _) = self {
+            bar.finish_and_clear();
+        }
+    }
+}

@@ -1,0 +1,145 @@
+//! What a render did, as a table and as JSON.
+
+use crate::error::{Error, Result};
+use serde::Serialize;
+use std::path::Path;
+
+/// Everything about one render. `--stats` writes it as JSON.
+#[derive(Clone, Debug, Serialize)]
+pub struct Report {
+    /// The scene's name.
+    pub scene: String,
+    /// How visibility was found.
+    pub method: String,
+    /// Pixels across and down.
+    pub size: [u32; 2],
+    /// Whole passes: camera samples a pixel.
+    pub spp: u32,
+    /// Shadow rays a camera sample.
+    pub shadow_rays: u32,
+    /// Threads.
+    pub threads: usize,
+    /// The seed.
+    pub seed: u64,
+    /// The SIMD level.
+    pub simd: String,
+    /// Whether it was stopped early.
+    pub interrupted: bool,
+    /// Where the time went.
+    pub time: Times,
+    /// The work done.
+    pub counts: WorkCounts,
+    /// Memory.
+    pub memory: Memory,
+    /// Against the reference, if one was given.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub error: Option<ErrorFigures>,
+}
+
+/// Seconds. The first four on the clock, the others summed over threads.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Times {
+    /// Reading the files.
+    pub load_s: f64,
+    /// Building the tree.
+    pub build_s: f64,
+    /// What a method prepares before the first pass.
+    pub preprocess_s: f64,
+    /// All passes.
+    pub render_s: f64,
+    /// Camera rays.
+    pub camera_s: f64,
+    /// Light samples.
+    pub light_s: f64,
+    /// Visibility.
+    pub visibility_s: f64,
+    /// Shading.
+    pub shade_s: f64,
+}
+
+/// Work done; tests count lanes in use.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct WorkCounts {
+    /// Camera rays.
+    pub camera_rays: u64,
+    /// Shadow rays.
+    pub shadow_rays: u64,
+    /// Ray and triangle, of shadow rays.
+    pub triangle_tests: u64,
+    /// Ray and box, of shadow rays.
+    pub node_tests: u64,
+    /// Ray and triangle, of camera rays.
+    pub camera_triangle_tests: u64,
+    /// Ray and box, of camera rays.
+    pub camera_node_tests: u64,
+}
+
+/// Bytes.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct Memory {
+    /// Nodes and triangle blocks.
+    pub bvh_bytes: usize,
+    /// The same for each triangle.
+    pub bvh_bytes_per_triangle: f64,
+    /// Triangles.
+    pub triangles: usize,
+}
+
+/// How far the image is from a reference.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct ErrorFigures {
+    /// Root of the mean square difference.
+    pub rmse: f64,
+    /// Mean square difference relative to the reference's square.
+    pub relmse: f64,
+    /// Mean of the image over mean of the reference.
+    pub mean_ratio: f64,
+}
+
+impl Report {
+    /// Writes it as JSON, whole or not at all.
+    pub fn write(&self, path: &Path) -> Result<()> {
+        let json = serde_json::to_string_pretty(self)
+            .map_err(|error| Error::input(path, format!("cannot be written as JSON: {error}")))?;
+        crate::output::write_bytes(path, format!("{json}\n").as_bytes())
+    }
+
+    /// A few lines for a person.
+    pub fn summary(&self) -> String {
+        let rays = self.counts.shadow_rays as f64;
+        let t = &self.time;
+        let mut text = format!(
+            "{}x{}, {} spp, {} shadow rays, {} threads, {}\n\
+             load {:.3} s, build {:.3} s, render {:.3} s (thread seconds: camera {:.3}, light {:.3}, visibility {:.3}, shade {:.3})\n",
+            self.size[0],
+            self.size[1],
+            self.spp,
+            self.shadow_rays,
+            self.threads,
+            self.simd,
+            t.load_s,
+            t.build_s,
+            t.render_s,
+            t.camera_s,
+            t.light_s,
+            t.visibility_s,
+            t.shade_s,
+        );
+        if rays > 0.0 {
+            text += &format!(
+                "{:.1} M shadow rays, {:.1} M a thread second; {:.2} triangle and {:.2} node tests a ray\n",
+                rays * 1e-6,
+                rays * 1e-6 / t.visibility_s.max(1e-9),
+                self.counts.triangle_tests as f64 / rays,
+                self.counts.node_tests as f64 / rays,
+            );
+        }
+        if let Some(error) = &self.error {
+            text += &format!(
+                "against the reference: RMSE {:.6}, relMSE {:.6}, ratio of means {:.5}\n",
+                error.rmse, error.relmse, error.mean_ratio
+            );
+        }
+        text
+    }
+}
