@@ -2,6 +2,7 @@
 
 pub mod error;
 pub mod film;
+pub mod output;
 pub mod scene;
 
 pub use error::{Error, Result};
