@@ -2,6 +2,7 @@
 
 pub mod error;
 pub mod film;
+pub mod metrics;
 pub mod output;
 pub mod scene;
 
