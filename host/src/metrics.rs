@@ -16,6 +16,8 @@
 //!
 //! Sums are in `f64` and in a fixed order, so any thread count gives the same bits.
 
+pub mod flip;
+
 use rayon::prelude::*;
 use serde::Serialize;
 
