@@ -1,8 +1,16 @@
 //! Renders the direct light of area lights with the `occlude` kernel.
 
 pub mod accel;
+pub mod cli;
 pub mod error;
+pub mod film;
+pub mod integrator;
 pub mod light;
+pub mod mesh;
+pub mod metrics;
+pub mod output;
+pub mod render;
+pub mod report;
 pub mod sampler;
 pub mod scene;
 

@@ -167,11 +167,11 @@ fn size(text: &str) -> std::result::Result<(u32, u32), String> {
 
 /// Runs the command.
 pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
-    for path in args.output.iter().chain(&args.stats) {
-        output::check_folder(path)?;
-    }
     for path in &args.output {
         output::check_writable(path)?;
+    }
+    if let Some(path) = &args.stats {
+        output::check_writable_bytes(path)?;
     }
     let reference = args.reference.as_ref().map(output::read).transpose()?;
 
@@ -241,7 +241,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let error = reference
         .map(|reference| metrics::compare(&image, &reference))
         .transpose()?
-        .map(|c| ErrorFigures { rmse: c.rmse, relmse: c.relmse, mean_ratio: c.mean_ratio_overall });
+        .map(|c| ErrorFigures { rmse: c.rmse, relmse: c.relmse, mean_ratio: c.mean_ratio_all.ratio });
     let seconds = |time: Duration| time.as_secs_f64();
     let report = Report {
         scene: scene.name.clone(),

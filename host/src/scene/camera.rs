@@ -18,3 +18,39 @@ pub struct Camera {
     /// Pixels down.
     pub height: u32,
 }
+
+/// A camera, ready to give rays.
+#[derive(Clone, Copy, Debug)]
+pub struct CameraFrame {
+    /// The pinhole.
+    pub eye: Vec3,
+    forward: glam::DVec3,
+    right: glam::DVec3,
+    down: glam::DVec3,
+}
+impl Camera {
+    /// f
+    pub fn frame(&self) -> CameraFrame {
+        let f = (self.target.as_dvec3() - self.eye.as_dvec3()).normalize();
+        let r = f.cross(self.up.as_dvec3()).normalize();
+        let u = r.cross(f);
+        let h = (f64::from(self.vfov_deg).to_radians() * 0.5).tan();
+        let (w, hh) = (f64::from(self.width), f64::from(self.height));
+        CameraFrame { eye: self.eye, forward: f - r * (h * w / hh) + u * h, right: r * (2.0 * h / hh), down: -u * (2.0 * h / hh) }
+    }
+}
+impl CameraFrame {
+    /// d
+    pub fn direction(&self, px: f32, py: f32) -> Vec3 {
+        (self.forward + self.right * f64::from(px) + self.down * f64::from(py)).normalize().as_vec3()
+    }
+}
+/// r
+#[derive(Clone, Debug, Default)]
+pub struct CameraRequest { /// f
+ pub file: Option<std::path::PathBuf>, /// f
+ pub eye: Option<Vec3>, /// f
+ pub target: Option<Vec3>, /// f
+ pub up: Option<Vec3>, /// f
+ pub vfov_deg: Option<f32>, /// f
+ pub size: Option<(u32,u32)> }

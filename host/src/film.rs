@@ -1,0 +1,304 @@
+//! What radiance is added to: the mean and the variance of every pixel.
+//!
+//! Pixels live tile by tile, each [`TileFilm`] owning its own, so that a thread
+//! is handed one tile of [`Film::tiles_mut`] and shares nothing. Nothing here
+//! clamps: estimates may be negative or above one, and an average of clamped
+//! estimates would be biased.
+
+use glam::{DVec3, Vec3};
+
+/// A rectangle of pixels, rows from the top.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, Hash)]
+pub struct Tile {
+    /// The leftmost column.
+    pub x: u32,
+    /// The topmost row.
+    pub y: u32,
+    /// Columns.
+    pub width: u32,
+    /// Rows.
+    pub height: u32,
+}
+
+impl Tile {
+    /// Tiles of `edge` by `edge` pixels that cover an image, row by row.
+    ///
+    /// Those at the right and at the bottom are as small as what is left. An edge of 0 counts as 1.
+    pub fn cover(width: u32, height: u32, edge: u32) -> impl Iterator<Item = Tile> {
+        let edge = edge.max(1);
+        (0..height.div_ceil(edge)).flat_map(move |row| {
+            (0..width.div_ceil(edge)).map(move |column| {
+                let (x, y) = (column * edge, row * edge);
+                Tile { x, y, width: edge.min(width - x), height: edge.min(height - y) }
+            })
+        })
+    }
+
+    /// How many pixels it has.
+    pub fn len(&self) -> usize {
+        self.width as usize * self.height as usize
+    }
+
+    /// Whether it has none.
+    pub fn is_empty(&self) -> bool {
+        self.len() == 0
+    }
+
+    /// Column and row in the image of its `pixel`th pixel, which are counted row by row.
+    pub fn position(&self, pixel: usize) -> (u32, u32) {
+        let width = self.width as usize;
+        (self.x + (pixel % width) as u32, self.y + (pixel / width) as u32)
+    }
+}
+
+/// Mean and summed squared deviation of one pixel.
+///
+/// Welford, "Note on a Method for Calculating Corrected Sums of Squares and Products", Technometrics 4(3), 1962.
+#[derive(Clone, Copy, Debug, Default)]
+struct Accumulator {
+    mean: DVec3,
+    deviation: DVec3, // sum of squares about the mean
+    count: u32,
+}
+
+impl Accumulator {
+    fn add(&mut self, radiance: DVec3) {
+        self.count += 1;
+        let before = radiance - self.mean;
+        self.mean += before / f64::from(self.count);
+        self.deviation += before * (radiance - self.mean);
+    }
+
+    fn variance_of_mean(&self) -> DVec3 {
+        if self.count < 2 {
+            return DVec3::ZERO;
+        }
+        let n = f64::from(self.count);
+        self.deviation / (n - 1.0) / n
+    }
+}
+
+/// The pixels of one tile.
+#[derive(Clone, Debug)]
+pub struct TileFilm {
+    tile: Tile,
+    pixels: Vec<Accumulator>,
+}
+
+impl TileFilm {
+    /// Which pixels of the image these are.
+    pub fn tile(&self) -> Tile {
+        self.tile
+    }
+
+    /// Adds the radiance that one pass found for a pixel; the tile's pixels are counted row by row.
+    ///
+    /// # Panics
+    /// If the tile has no such pixel.
+    #[inline]
+    pub fn add(&mut self, pixel: usize, radiance: Vec3) {
+        self.pixels[pixel].add(radiance.as_dvec3());
+    }
+
+    /// How many passes a pixel has had.
+    ///
+    /// # Panics
+    /// If the tile has no such pixel.
+    pub fn count(&self, pixel: usize) -> u32 {
+        self.pixels[pixel].count
+    }
+}
+
+/// The mean and the variance of the radiance of every pixel, over passes.
+///
+/// A pass need not reach every pixel: an interrupted render leaves tiles with
+/// different counts, and every pixel is the average of those it has had.
+/// 56 bytes a pixel.
+#[derive(Clone, Debug)]
+pub struct Film {
+    width: u32,
+    height: u32,
+    tiles: Vec<TileFilm>,
+}
+
+impl Film {
+    /// Edge of the tiles of [`Film::new`], pixels.
+    pub const TILE: u32 = 16;
+
+    /// A film nothing has been added to, in tiles of [`Film::TILE`] pixels.
+    pub fn new(width: u32, height: u32) -> Self {
+        Self::with_tiles(width, height, Self::TILE)
+    }
+
+    /// The same in tiles of another edge. What it develops to does not depend on the edge.
+    pub fn with_tiles(width: u32, height: u32, edge: u32) -> Self {
+        let tiles = Tile::cover(width, height, edge)
+            .map(|tile| TileFilm { tile, pixels: vec![Accumulator::default(); tile.len()] })
+            .collect();
+        Self { width, height, tiles }
+    }
+
+    /// Pixels across.
+    pub fn width(&self) -> u32 {
+        self.width
+    }
+
+    /// Pixels down.
+    pub fn height(&self) -> u32 {
+        self.height
+    }
+
+    /// The tiles, row by row.
+    pub fn tiles(&self) -> &[TileFilm] {
+        &self.tiles
+    }
+
+    /// The tiles, row by row, each to be given to one thread.
+    pub fn tiles_mut(&mut self) -> &mut [TileFilm] {
+        &mut self.tiles
+    }
+
+    /// The least and the greatest number of passes that a pixel has had.
+    pub fn passes(&self) -> (u32, u32) {
+        let mut counts = self.tiles.iter().flat_map(|t| &t.pixels).map(|p| p.count);
+        let first = counts.next().unwrap_or(0);
+        counts.fold((first, first), |(least, most), count| (least.min(count), most.max(count)))
+    }
+
+    /// The mean of each pixel; black where nothing was added.
+    pub fn develop(&self) -> Image {
+        self.image(|pixel| pixel.mean)
+    }
+
+    /// The variance of each pixel of [`Film::develop`]: that of a pass, divided by the number of passes.
+    ///
+    /// Estimated from the passes themselves, so 0, which here means *unknown*, where there were fewer
+    /// than two: see [`Film::passes`].
+    pub fn variance_of_mean(&self) -> Image {
+        self.image(Accumulator::variance_of_mean)
+    }
+
+    /// The standard error of each pixel of [`Film::develop`]: the root of [`Film::variance_of_mean`].
+    pub fn standard_error(&self) -> Image {
+        self.image(|pixel| pixel.variance_of_mean().map(f64::sqrt))
+    }
+
+    fn image(&self, value: impl Fn(&Accumulator) -> DVec3) -> Image {
+        let mut image = Image::new(self.width, self.height);
+        for TileFilm { tile, pixels } in &self.tiles {
+            for (i, pixel) in pixels.iter().enumerate() {
+                let (x, y) = tile.position(i);
+                image.pixels[y as usize * self.width as usize + x as usize] =
+                    value(pixel).as_vec3().to_array();
+            }
+        }
+        image
+    }
+}
+
+/// Linear radiance, red, green and blue, rows from the top.
+#[derive(Clone, Debug, Default, PartialEq)]
+pub struct Image {
+    /// Pixels across.
+    pub width: u32,
+    /// Pixels down.
+    pub height: u32,
+    /// `width * height` of them, row by row.
+    pub pixels: Vec<[f32; 3]>,
+}
+
+impl Image {
+    /// A black one.
+    pub fn new(width: u32, height: u32) -> Self {
+        Self { width, height, pixels: vec![[0.0; 3]; width as usize * height as usize] }
+    }
+
+    /// One whose pixels are computed from column and row.
+    pub fn from_fn(width: u32, height: u32, mut pixel: impl FnMut(u32, u32) -> [f32; 3]) -> Self {
+        let pixels = (0..height).flat_map(|y| (0..width).map(move |x| (x, y)));
+        Self { width, height, pixels: pixels.map(|(x, y)| pixel(x, y)).collect() }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    fn radiance(x: u32, y: u32, pass: u32) -> Vec3 {
+        let k = f64::from(x * 7919 + y * 104_729 + pass * 1_299_709) * 0.618_033_988_75;
+        Vec3::new(k.fract() as f32, (k * 3.0).fract() as f32 - 0.5, 1e4 + (k * 5.0).fract() as f32)
+    }
+
+    #[test]
+    fn tiles_cover_every_pixel_once_in_rows() {
+        for (width, height, edge) in [(33, 17, 16), (5, 3, 8), (4, 4, 1), (3, 2, 0), (0, 5, 4), (5, 0, 4)] {
+            let mut seen = vec![0; (width * height) as usize];
+            let tiles: Vec<_> = Tile::cover(width, height, edge).collect();
+            assert!(tiles.is_sorted_by_key(|t| (t.y, t.x)));
+            for tile in tiles {
+                for i in 0..tile.len() {
+                    let (x, y) = tile.position(i);
+                    seen[(y * width + x) as usize] += 1;
+                }
+            }
+            assert!(seen.iter().all(|&n| n == 1));
+        }
+    }
+
+    #[test]
+    fn mean_and_variance_are_those_of_two_passes_over_the_data() {
+        const PASSES: u32 = 50;
+        let mut film = Film::with_tiles(19, 9, 4);
+        for pass in 0..PASSES {
+            for tile in film.tiles_mut() {
+                for i in 0..tile.tile().len() {
+                    let (x, y) = tile.tile().position(i);
+                    tile.add(i, radiance(x, y, pass));
+                }
+            }
+        }
+        assert_eq!(film.passes(), (PASSES, PASSES));
+        let (mean, variance, error) = (film.develop(), film.variance_of_mean(), film.standard_error());
+        for (i, (x, y)) in (0..9).flat_map(|y| (0..19).map(move |x| (x, y))).enumerate() {
+            let n = f64::from(PASSES);
+            let samples: Vec<_> = (0..PASSES).map(|p| radiance(x, y, p).as_dvec3()).collect();
+            let m = samples.iter().sum::<DVec3>() / n;
+            let v = samples.iter().map(|s| (s - m) * (s - m)).sum::<DVec3>() / (n - 1.0) / n;
+            for c in 0..3 {
+                assert!((f64::from(mean.pixels[i][c]) - m[c]).abs() <= 1e-7 * m[c].abs());
+                assert!((f64::from(variance.pixels[i][c]) - v[c]).abs() < 1e-6 * v[c]);
+                assert!((f64::from(error.pixels[i][c]) - v[c].sqrt()).abs() < 1e-6 * v[c].sqrt());
+            }
+        }
+    }
+
+    #[test]
+    fn fewer_than_two_passes_have_no_variance_and_no_nan() {
+        let mut film = Film::with_tiles(4, 2, 2);
+        film.tiles_mut()[1].add(3, Vec3::new(-2.0, 0.5, 3.0));
+        assert_eq!(film.passes(), (0, 1));
+        assert_eq!(film.tiles()[1].count(3), 1);
+        assert_eq!(film.develop().pixels[7], [-2.0, 0.5, 3.0]);
+        assert!(film.develop().pixels[..7].iter().all(|p| *p == [0.0; 3]));
+        assert!(film.standard_error().pixels.iter().all(|p| *p == [0.0; 3]));
+        assert_eq!(Film::new(0, 0).passes(), (0, 0));
+    }
+
+    #[test]
+    fn the_edge_of_the_tiles_changes_nothing() {
+        let render = |edge| {
+            let mut film = Film::with_tiles(21, 13, edge);
+            for pass in 0..5 {
+                for tile in film.tiles_mut() {
+                    for i in 0..tile.tile().len() {
+                        let (x, y) = tile.tile().position(i);
+                        tile.add(i, radiance(x, y, pass));
+                    }
+                }
+            }
+            (film.develop(), film.variance_of_mean())
+        };
+        assert_eq!(render(16), render(1));
+        assert_eq!(render(16), render(7));
+    }
+}
