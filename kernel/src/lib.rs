@@ -30,6 +30,7 @@ pub mod lanes;
 pub mod polygon;
 pub mod ray;
 pub mod triangle;
+mod vec3x;
 
 pub use bvh::{Bvh, BvhError, Child, HitPacket, Node, Targets, offset};
 pub use counter::{Counter, Counts, Uncounted};

@@ -20,6 +20,7 @@
 //! All of it is single operations in a fixed order, so every width gives the same answer bit for bit.
 
 use crate::lanes::{Lanes, Mask, Simd};
+use crate::vec3x::{self, Vec3x};
 use bytemuck::{Pod, Zeroable};
 use glam::Vec3;
 
@@ -113,7 +114,7 @@ impl Axes {
 pub(crate) struct Sheared<L> {
     pub(crate) axes: Axes,
     /// The origin, by world axis.
-    pub(crate) origin: [L; 3],
+    pub(crate) origin: Vec3x<L>,
     /// How x and y move for a step along z, and how far t does.
     pub(crate) shear: [L; 3],
     pub(crate) t_min: L,
@@ -136,8 +137,8 @@ impl<L: Lanes> Sheared<L> {
     pub(crate) fn new(
         token: L::Token,
         axes: Axes,
-        origin: [L; 3],
-        direction: [L; 3],
+        origin: Vec3x<L>,
+        direction: Vec3x<L>,
         t_min: L,
         t_max: L,
     ) -> Self {
@@ -148,7 +149,7 @@ impl<L: Lanes> Sheared<L> {
 
     /// A vertex with the ray's origin at 0 and the ray along z.
     #[inline(always)]
-    fn vertex(&self, vertex: [L; 3]) -> [L; 3] {
+    fn vertex(&self, vertex: Vec3x<L>) -> Vec3x<L> {
         let Axes { x, y, z } = self.axes;
         let depth = vertex[z] - self.origin[z];
         [
@@ -160,8 +161,8 @@ impl<L: Lanes> Sheared<L> {
 
     /// Where these rays meet these triangles, lane by lane; either side may be splatted. NaN is a miss.
     #[inline(always)]
-    pub(crate) fn cross(&self, token: L::Token, triangle: [[L; 3]; 3]) -> Crossing<L> {
-        let [a, b, c] = triangle.map(|vertex| self.vertex(vertex));
+    pub(crate) fn cross(&self, token: L::Token, triangle: [Vec3x<L>; 3]) -> Crossing<L> {
+        let [a, b, c] = [self.vertex(triangle[0]), self.vertex(triangle[1]), self.vertex(triangle[2])];
         let u = c[0] * b[1] - c[1] * b[0];
         let v = a[0] * c[1] - a[1] * c[0];
         let w = b[0] * a[1] - b[1] * a[0];
@@ -187,10 +188,8 @@ where
     pub(crate) fn cross_block(&self, token: S::Token, block: &TriangleBlock, found: &mut Found) -> u32 {
         let mut hits = 0;
         for from in (0..TriangleBlock::WIDTH).step_by(S::WIDTH) {
-            let triangle = block
-                .vertices
-                .each_ref()
-                .map(|vertex| vertex.each_ref().map(|axis| S::load(token, &axis[from..])));
+            let [a, b, c] = &block.vertices;
+            let triangle = [vec3x::load(token, a, from), vec3x::load(token, b, from), vec3x::load(token, c, from)];
             let crossing = self.cross(token, triangle);
             let bits = crossing.hit.bits();
             if bits != 0 {
@@ -236,15 +235,14 @@ pub(crate) fn dominant_axis(origin: Vec3, direction: Vec3) -> Option<usize> {
 #[inline(always)]
 pub(crate) fn shear_one<S: Simd>(simd: S, ray: &crate::Ray, axis: usize) -> Sheared<S::Node> {
     let token = simd.token();
-    let splat = |value: f32| S::Node::splat(token, value);
     // Divided once as scalars: the same division as in any lane.
     let axes = Axes::of(axis);
     let z = ray.direction[axes.z];
     Sheared {
         axes,
-        origin: ray.origin.to_array().map(splat),
-        shear: [splat(ray.direction[axes.x] / z), splat(ray.direction[axes.y] / z), splat(1.0 / z)],
-        t_min: splat(ray.t_min),
-        t_max: splat(ray.t_max),
+        origin: vec3x::splat(token, ray.origin.to_array()),
+        shear: vec3x::splat(token, [ray.direction[axes.x] / z, ray.direction[axes.y] / z, 1.0 / z]),
+        t_min: S::Node::splat(token, ray.t_min),
+        t_max: S::Node::splat(token, ray.t_max),
     }
 }

@@ -4,6 +4,7 @@ use super::Bvh;
 use super::packet::{Any, Rays};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
+use crate::vec3x;
 use glam::Vec3;
 
 /// The far ends of a batch: points on a light, one coordinate a slice, all of one length.
@@ -60,24 +61,18 @@ impl<S: Simd> Bvh<'_, S> {
         let width = S::Packet::WIDTH;
         let words = targets.len().div_ceil(64);
         blocked[..words].fill(0);
-        let mut tail = [[0.0; 16]; 3];
+        let mut tail = [0.0; 16];
         for from in (0..targets.len()).step_by(width) {
             let rest = (targets.len() - from).min(width);
-            let origin = x.map(|axis| S::Packet::splat(token, axis));
-            let mut axis = 0;
-            let ends = [targets.x, targets.y, targets.z].map(|coordinates| {
-                let part = &coordinates[from..from + rest];
-                axis += 1;
-                if rest == width {
-                    S::Packet::load(token, part)
-                } else {
-                    tail[axis - 1][..rest].copy_from_slice(part);
-                    S::Packet::load(token, &tail[axis - 1])
-                }
-            });
+            let origin = vec3x::splat(token, x);
+            let ends = [
+                ends_of::<S>(token, targets.x, from, rest, &mut tail),
+                ends_of::<S>(token, targets.y, from, rest, &mut tail),
+                ends_of::<S>(token, targets.z, from, rest, &mut tail),
+            ];
             let rays = Rays {
                 origin,
-                direction: core::array::from_fn(|axis| ends[axis] - origin[axis]),
+                direction: vec3x::sub(ends, origin),
                 t_min: S::Packet::splat(token, 0.0),
                 t_max: S::Packet::splat(token, 1.0),
             };
@@ -86,4 +81,14 @@ impl<S: Simd> Bvh<'_, S> {
             blocked[from / 64] |= u64::from(any.blocked) << (from % 64);
         }
     }
+}
+
+/// The coordinates of up to a vector's width of targets; lanes beyond the last hold anything.
+#[inline(always)]
+fn ends_of<S: Simd>(token: S::Token, all: &[f32], from: usize, count: usize, tail: &mut [f32; 16]) -> S::Packet {
+    if count == S::Packet::WIDTH {
+        return S::Packet::load(token, &all[from..]);
+    }
+    tail[..count].copy_from_slice(&all[from..from + count]);
+    S::Packet::load(token, tail)
 }

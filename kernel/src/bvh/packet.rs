@@ -6,6 +6,7 @@ use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::{Hit, RayPacket};
 use crate::triangle::{Axes, Found, Sheared, TriangleBlock};
+use crate::vec3x::{self, Vec3x};
 use core::ops::ControlFlow;
 
 /// The nearest hits of a packet.
@@ -19,8 +20,8 @@ pub struct HitPacket {
 
 /// Rays side by side, as vectors.
 pub(super) struct Rays<L> {
-    pub(super) origin: [L; 3],
-    pub(super) direction: [L; 3],
+    pub(super) origin: Vec3x<L>,
+    pub(super) direction: Vec3x<L>,
     pub(super) t_min: L,
     pub(super) t_max: L,
 }
@@ -188,12 +189,11 @@ impl<S: Simd> Bvh<'_, S> {
             if active == 0 {
                 continue;
             }
-            let load = |lanes: &[f32; RayPacket::WIDTH]| S::Packet::load(token, &lanes[from..]);
             let chunk = Rays {
-                origin: rays.origin.each_ref().map(load),
-                direction: rays.direction.each_ref().map(load),
-                t_min: load(&rays.t_min),
-                t_max: load(&rays.t_max),
+                origin: vec3x::load(token, &rays.origin, from),
+                direction: vec3x::load(token, &rays.direction, from),
+                t_min: S::Packet::load(token, &rays.t_min[from..]),
+                t_max: S::Packet::load(token, &rays.t_max[from..]),
             };
             ask(&chunk, active, from, counter);
         }
@@ -214,25 +214,29 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         let token = self.simd.token();
-        let splat = |value| S::Packet::splat(token, value);
-        let infinity = splat(f32::INFINITY);
-        let [x, y, z] = rays.direction.map(S::Packet::abs);
-        let finite = |v: S::Packet| v.abs().lt(infinity);
-        let [ox, oy, oz] = rays.origin.map(finite);
-        let sound = finite(x) & finite(y) & finite(z) & ox & oy & oz;
-        let active = active & (sound & splat(SHORTEST).le(x.max(y).max(z))).bits();
+        let infinity = S::Packet::splat(token, f32::INFINITY);
+        let length = vec3x::abs(rays.direction);
+        let place = vec3x::abs(rays.origin);
+        let [x, y, z] = length;
+        let finite = x.lt(infinity) & y.lt(infinity) & z.lt(infinity);
+        let finite = finite & place[0].lt(infinity) & place[1].lt(infinity) & place[2].lt(infinity);
+        let shortest = S::Packet::splat(token, SHORTEST);
+        let active = active & (finite & shortest.le(vec3x::most(length))).bits();
         // The rule of `Axes::dominant`.
         let along_x = active & (y.le(x) & z.le(x)).bits();
         let along_y = active & !along_x & z.le(y).bits();
         let along_z = active & !along_x & !along_y;
 
-        let [ox, oy, oz] = rays.origin.map(S::Packet::abs);
-        let slack = (splat(self.magnitude) + ox.max(oy).max(oz)) * splat(16.0 * super::ROUNDING);
+        let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
+        let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
         let slabs = PacketSlabs::new(token, rays.origin, rays.direction, rays.t_min, slack);
-        for (axis, active) in [along_x, along_y, along_z].into_iter().enumerate() {
+        let mut axis = 0;
+        while axis < 3 {
+            let active = [along_x, along_y, along_z][axis];
             if active != 0 {
                 self.traverse_packet(rays, &slabs, Axes::of(axis), active, ignore, counter, visitor);
             }
+            axis += 1;
         }
     }
 
@@ -272,8 +276,12 @@ impl<S: Simd> Bvh<'_, S> {
                         break;
                     }
                     counter.triangle_tests((meet & active).count_ones());
-                    let triangle =
-                        block.vertices.map(|vertex| vertex.map(|axis| S::Packet::splat(token, axis[lane])));
+                    let [a, b, c] = &block.vertices;
+                    let triangle = [
+                        vec3x::broadcast(token, a, lane),
+                        vec3x::broadcast(token, b, lane),
+                        vec3x::broadcast(token, c, lane),
+                    ];
                     let crossing = sheared.cross(token, triangle);
                     let bits = crossing.hit.bits() & meet & active;
                     if bits == 0 || !counts(id, ignore) {

@@ -6,6 +6,8 @@
 
 use super::Node;
 use crate::lanes::{Lanes, Mask};
+use crate::vec3x::{self, Vec3x};
+use glam::Vec3;
 
 /// Below this length a direction counts as zero.
 pub(super) const SHORTEST: f32 = 1e-27;
@@ -17,9 +19,9 @@ const FLATTEST: f32 = 1e-9;
 /// One ray in every lane, for the boxes of a node's children.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Slabs<L> {
-    inverse: [L; 3],
-    near: [L; 3],
-    far: [L; 3],
+    inverse: Vec3x<L>,
+    near: Vec3x<L>,
+    far: Vec3x<L>,
     /// Which side is near: 0 where the ray grows, 1 where it falls.
     near_side: [usize; 3],
     t_min: L,
@@ -36,17 +38,31 @@ impl<L: Lanes> Slabs<L> {
     #[inline(always)]
     pub(super) fn new(token: L::Token, ray: &crate::Ray, slack: f32) -> Self {
         let longest = ray.direction.abs().max_element();
-        let inverse = ray.direction.to_array().map(|component| inverse(component, longest));
-        let splat = |value| L::splat(token, value);
-        let shift =
-            |axis: usize, slack: f32| splat(slack * inverse[axis].abs() - ray.origin[axis] * inverse[axis]);
+        let inverse = Vec3::new(
+            inverse(ray.direction.x, longest),
+            inverse(ray.direction.y, longest),
+            inverse(ray.direction.z, longest),
+        );
+        let (back, wide) = (-ray.origin * inverse, slack * inverse.abs());
         Self {
-            inverse: inverse.map(splat),
-            near: [shift(0, -slack), shift(1, -slack), shift(2, -slack)],
-            far: [shift(0, slack), shift(1, slack), shift(2, slack)],
-            near_side: inverse.map(|inverse| usize::from(inverse < 0.0)),
-            t_min: splat(ray.t_min),
+            inverse: vec3x::splat(token, inverse.to_array()),
+            near: vec3x::splat(token, (back - wide).to_array()),
+            far: vec3x::splat(token, (back + wide).to_array()),
+            near_side: [
+                usize::from(inverse.x < 0.0),
+                usize::from(inverse.y < 0.0),
+                usize::from(inverse.z < 0.0),
+            ],
+            t_min: L::splat(token, ray.t_min),
         }
+    }
+
+    /// Where the ray crosses the near or the far planes of an axis.
+    #[inline(always)]
+    fn planes(&self, token: L::Token, node: &Node, from: usize, axis: usize, far: usize) -> L {
+        let side = (self.near_side[axis] & 1) ^ far;
+        let plane = L::load(token, &node.bounds[side][axis][from..]);
+        plane.mul_add(self.inverse[axis], if far == 0 { self.near[axis] } else { self.far[axis] })
     }
 
     /// Which children the ray may meet up to `t_max`, as bits, and from which `t` on.
@@ -54,19 +70,23 @@ impl<L: Lanes> Slabs<L> {
     pub(super) fn children(&self, token: L::Token, node: &Node, t_max: f32, entry: &mut [f32; 8]) -> u32 {
         let t_max = L::splat(token, t_max);
         let mut met = 0;
-        for from in (0..Node::WIDTH).step_by(L::WIDTH) {
-            let near = |axis: usize| {
-                let plane = L::load(token, &node.bounds[self.near_side[axis] & 1][axis][from..]);
-                plane.mul_add(self.inverse[axis], self.near[axis])
-            };
-            let far = |axis: usize| {
-                let plane = L::load(token, &node.bounds[(self.near_side[axis] & 1) ^ 1][axis][from..]);
-                plane.mul_add(self.inverse[axis], self.far[axis])
-            };
-            let enter = near(0).max(near(1)).max(near(2).max(self.t_min));
-            let leave = far(0).min(far(1)).min(far(2).min(t_max));
+        let mut from = 0;
+        while from < Node::WIDTH {
+            let near = [
+                self.planes(token, node, from, 0, 0),
+                self.planes(token, node, from, 1, 0),
+                self.planes(token, node, from, 2, 0),
+            ];
+            let far = [
+                self.planes(token, node, from, 0, 1),
+                self.planes(token, node, from, 1, 1),
+                self.planes(token, node, from, 2, 1),
+            ];
+            let enter = near[0].max(near[1]).max(near[2].max(self.t_min));
+            let leave = far[0].min(far[1]).min(far[2].min(t_max));
             enter.store(&mut entry[from..]);
             met |= enter.le(leave).bits() << from;
+            from += L::WIDTH;
         }
         met
     }
@@ -75,40 +95,47 @@ impl<L: Lanes> Slabs<L> {
 /// One ray a lane, for one box at a time.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct PacketSlabs<L> {
-    inverse: [L; 3],
-    near: [L; 3],
-    far: [L; 3],
+    inverse: Vec3x<L>,
+    near: Vec3x<L>,
+    far: Vec3x<L>,
     t_min: L,
 }
 
 impl<L: Lanes> PacketSlabs<L> {
     #[inline(always)]
-    pub(super) fn new(token: L::Token, origin: [L; 3], direction: [L; 3], t_min: L, slack: L) -> Self {
-        let length = direction.map(L::abs);
-        let least = length[0].max(length[1]).max(length[2]) * L::splat(token, FLATTEST);
-        let (zero, one) = (L::splat(token, 0.0), L::splat(token, 1.0));
-        let inverse: [L; 3] = core::array::from_fn(|axis| {
-            let flat = L::select(direction[axis].lt(zero), -least, least);
-            one / L::select(length[axis].lt(least), flat, direction[axis])
-        });
-        let shift = |axis: usize, slack: L| slack * inverse[axis].abs() - origin[axis] * inverse[axis];
-        Self {
-            inverse,
-            near: core::array::from_fn(|axis| shift(axis, -slack)),
-            far: core::array::from_fn(|axis| shift(axis, slack)),
-            t_min,
-        }
+    pub(super) fn new(token: L::Token, origin: Vec3x<L>, direction: Vec3x<L>, t_min: L, slack: L) -> Self {
+        let length = vec3x::abs(direction);
+        let least = vec3x::most(length) * L::splat(token, FLATTEST);
+        let x = Self::axis(token, origin[0], direction[0], length[0], least, slack);
+        let y = Self::axis(token, origin[1], direction[1], length[1], least, slack);
+        let z = Self::axis(token, origin[2], direction[2], length[2], least, slack);
+        Self { inverse: [x.0, y.0, z.0], near: [x.1, y.1, z.1], far: [x.2, y.2, z.2], t_min }
+    }
+
+    /// The inverse, and the constants of near and far planes, of one axis.
+    #[inline(always)]
+    fn axis(token: L::Token, origin: L, direction: L, length: L, least: L, slack: L) -> (L, L, L) {
+        let flat = L::select(direction.lt(L::splat(token, 0.0)), -least, least);
+        let inverse = L::splat(token, 1.0) / L::select(length.lt(least), flat, direction);
+        let (back, wide) = (-origin * inverse, slack * inverse.abs());
+        (inverse, back - wide, back + wide)
     }
 
     /// Which rays may meet a box up to `t_max`, and from which `t` on.
     #[inline(always)]
     pub(super) fn meet(&self, token: L::Token, node: &Node, place: usize, t_max: L) -> (L::Mask, L) {
-        let side =
-            |side: usize, axis: usize| L::splat(token, node.bounds[side][axis][place]) * self.inverse[axis];
-        let near = |axis: usize| side(0, axis).min(side(1, axis)) + self.near[axis];
-        let far = |axis: usize| side(0, axis).max(side(1, axis)) + self.far[axis];
-        let enter = near(0).max(near(1)).max(near(2).max(self.t_min));
-        let leave = far(0).min(far(1)).min(far(2).min(t_max));
+        let x = self.slab(token, node, place, 0);
+        let y = self.slab(token, node, place, 1);
+        let z = self.slab(token, node, place, 2);
+        let enter = x.0.max(y.0).max(z.0.max(self.t_min));
+        let leave = x.1.min(y.1).min(z.1.min(t_max));
         (enter.le(leave), enter)
+    }
+
+    #[inline(always)]
+    fn slab(&self, token: L::Token, node: &Node, place: usize, axis: usize) -> (L, L) {
+        let lower = L::splat(token, node.bounds[0][axis][place]) * self.inverse[axis];
+        let upper = L::splat(token, node.bounds[1][axis][place]) * self.inverse[axis];
+        (lower.min(upper) + self.near[axis], lower.max(upper) + self.far[axis])
     }
 }
