@@ -52,7 +52,8 @@ impl Sampler {
                 let shift = [self.word(), self.word()];
                 points.extend((0..count as u32).map(|i| {
                     let along = (u64::from(i) << 32) / count as u64;
-                    let across = (u64::from(i) * u64::from(generator) % count as u64 * (1 << 32)) / count as u64;
+                    let across =
+                        (u64::from(i) * u64::from(generator) % count as u64 * (1 << 32)) / count as u64;
                     [unit(shift[0].wrapping_add(along as u32)), unit(shift[1].wrapping_add(across as u32))]
                 }));
             }

@@ -189,7 +189,8 @@ where
         let mut hits = 0;
         for from in (0..TriangleBlock::WIDTH).step_by(S::WIDTH) {
             let [a, b, c] = &block.vertices;
-            let triangle = [vec3x::load(token, a, from), vec3x::load(token, b, from), vec3x::load(token, c, from)];
+            let triangle =
+                [vec3x::load(token, a, from), vec3x::load(token, b, from), vec3x::load(token, c, from)];
             let crossing = self.cross(token, triangle);
             let bits = crossing.hit.bits();
             if bits != 0 {

@@ -22,7 +22,11 @@ pub(crate) fn load<L: Lanes, const N: usize>(token: L::Token, v: &[[f32; N]; 3],
 
 /// The vector of one lane in all of them.
 #[inline(always)]
-pub(crate) fn broadcast<L: Lanes, const N: usize>(token: L::Token, v: &[[f32; N]; 3], lane: usize) -> Vec3x<L> {
+pub(crate) fn broadcast<L: Lanes, const N: usize>(
+    token: L::Token,
+    v: &[[f32; N]; 3],
+    lane: usize,
+) -> Vec3x<L> {
     splat(token, [v[0][lane], v[1][lane], v[2][lane]])
 }
 

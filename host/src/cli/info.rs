@@ -57,7 +57,11 @@ fn machine(level: Level) -> String {
     let mut text = String::new();
     let known: Vec<&str> = levels().map(level_name).collect();
     let _ = writeln!(text, "SIMD the CPU has     {}", known.join(", "));
-    let _ = writeln!(text, "SIMD in use          {} (chosen at run time; --simd LEVEL forces one)", level_name(level));
+    let _ = writeln!(
+        text,
+        "SIMD in use          {} (chosen at run time; --simd LEVEL forces one)",
+        level_name(level)
+    );
     let _ = writeln!(text, "compiled for         {} (code outside the kernel's queries)", compiled_for());
     if level_name(level) != level_name(detect()) {
         let _ = writeln!(text, "warning: the CPU could do {}, which is faster", level_name(detect()));
@@ -123,7 +127,10 @@ fn scene_info(path: &std::path::Path, args: &InfoArgs) -> Result<String> {
         let p = light.power();
         line(
             &format!("  light {index}"),
-            format!("{shape}, area {:.6} m², power {:.4} {:.4} {:.4} W, normal {}", light.area, p.x, p.y, p.z, light.normal),
+            format!(
+                "{shape}, area {:.6} m², power {:.4} {:.4} {:.4} W, normal {}",
+                light.area, p.x, p.y, p.z, light.normal
+            ),
         );
     }
     if lights.len() > SHOWN {
@@ -145,9 +152,20 @@ fn scene_info(path: &std::path::Path, args: &InfoArgs) -> Result<String> {
     );
     line(
         "tree memory",
-        format!("{:.1} MB, {:.1} bytes a triangle", stats.bytes as f64 * 1e-6, stats.bytes as f64 / scene.triangles.len().max(1) as f64),
+        format!(
+            "{:.1} MB, {:.1} bytes a triangle",
+            stats.bytes as f64 * 1e-6,
+            stats.bytes as f64 / scene.triangles.len().max(1) as f64
+        ),
     );
     let geometry = scene.positions.len() * 12 + scene.triangles.len() * 16;
-    line("scene memory", format!("{:.1} MB, {:.1} bytes a triangle", geometry as f64 * 1e-6, geometry as f64 / scene.triangles.len().max(1) as f64));
+    line(
+        "scene memory",
+        format!(
+            "{:.1} MB, {:.1} bytes a triangle",
+            geometry as f64 * 1e-6,
+            geometry as f64 / scene.triangles.len().max(1) as f64
+        ),
+    );
     Ok(text)
 }

@@ -192,8 +192,11 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
             )));
         }
     }
-    let outputs =
-        if args.output.is_empty() { vec![PathBuf::from(format!("{}.png", scene.name))] } else { args.output.clone() };
+    let outputs = if args.output.is_empty() {
+        vec![PathBuf::from(format!("{}.png", scene.name))]
+    } else {
+        args.output.clone()
+    };
     for path in &outputs {
         output::check_writable(path)?;
     }

@@ -9,7 +9,13 @@ use occlude_kernel::{Bvh, Counter, Counts, Simd, Targets, Uncounted};
 pub struct Exact;
 
 impl Visibility for Exact {
-    fn estimate(&self, stage: &Stage<'_>, questions: &Questions, estimates: &mut Vec<f32>, counts: &mut Counts) {
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
         estimates.clear();
         let bvh = stage.bvh;
         if stage.count {

@@ -45,7 +45,13 @@ pub struct Stage<'a> {
 pub trait Visibility: Sync {
     /// Writes an estimate for each sample of `questions`, in their order: right on average, and for an exact
     /// method 0 or 1.
-    fn estimate(&self, stage: &Stage<'_>, questions: &Questions, estimates: &mut Vec<f32>, counts: &mut Counts);
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    );
 }
 
 /// A point that light may reach.
@@ -165,6 +171,14 @@ pub fn render_tile(
         visibility: visibility_end - light_end,
         shade: visibility_end.elapsed(),
     };
+}
+
+/// What one pass over a tile asks: for benchmarks and tests of visibility alone.
+pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
+    let mut scratch = Scratch { radiance: vec![Vec3::ZERO; tile.len()], ..Scratch::default() };
+    cast(stage, tile, width, pass, &mut scratch);
+    sample_lights(stage, &mut scratch);
+    scratch.questions
 }
 
 /// The nearest hits of up to 16 camera rays.
@@ -300,7 +314,8 @@ fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
         let arrives: f32 =
             questions.weights[samples.clone()].iter().zip(&estimates[samples]).map(|(w, v)| w * v).sum();
         let point = &questions.points[batch.point as usize];
-        radiance[point.pixel as usize] += point.diffuse * stage.lights[batch.light as usize].radiance * arrives;
+        radiance[point.pixel as usize] +=
+            point.diffuse * stage.lights[batch.light as usize].radiance * arrives;
     }
     for (pixel, &radiance) in radiance.iter().enumerate() {
         film.add(pixel, radiance);

@@ -36,7 +36,12 @@ impl Camera {
         let u = r.cross(f);
         let h = (f64::from(self.vfov_deg).to_radians() * 0.5).tan();
         let (w, hh) = (f64::from(self.width), f64::from(self.height));
-        CameraFrame { eye: self.eye, forward: f - r * (h * w / hh) + u * h, right: r * (2.0 * h / hh), down: -u * (2.0 * h / hh) }
+        CameraFrame {
+            eye: self.eye,
+            forward: f - r * (h * w / hh) + u * h,
+            right: r * (2.0 * h / hh),
+            down: -u * (2.0 * h / hh),
+        }
     }
 }
 impl CameraFrame {
@@ -47,10 +52,17 @@ impl CameraFrame {
 }
 /// r
 #[derive(Clone, Debug, Default)]
-pub struct CameraRequest { /// f
- pub file: Option<std::path::PathBuf>, /// f
- pub eye: Option<Vec3>, /// f
- pub target: Option<Vec3>, /// f
- pub up: Option<Vec3>, /// f
- pub vfov_deg: Option<f32>, /// f
- pub size: Option<(u32,u32)> }
+pub struct CameraRequest {
+    /// f
+    pub file: Option<std::path::PathBuf>,
+    /// f
+    pub eye: Option<Vec3>,
+    /// f
+    pub target: Option<Vec3>,
+    /// f
+    pub up: Option<Vec3>,
+    /// f
+    pub vfov_deg: Option<f32>,
+    /// f
+    pub size: Option<(u32, u32)>,
+}

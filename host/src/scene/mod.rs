@@ -74,17 +74,23 @@ impl Scene {
 /// TEMP
 pub fn load(path: &std::path::Path, _r: &CameraRequest) -> crate::Result<Scene> {
     let file = if path.is_dir() { path.join("scene.obj") } else { path.to_owned() };
-    let (models, mats) = tobj::load_obj(&file, &tobj::LoadOptions { triangulate: true, ..Default::default() }).map_err(|e| crate::Error::input(&file, e.to_string()))?;
+    let (models, mats) =
+        tobj::load_obj(&file, &tobj::LoadOptions { triangulate: true, ..Default::default() })
+            .map_err(|e| crate::Error::input(&file, e.to_string()))?;
     let mats = mats.map_err(|e| crate::Error::input(&file, e.to_string()))?;
-    let mut s = Scene { name: path.file_stem().unwrap().to_string_lossy().into_owned(), ..Default::default() };
+    let mut s =
+        Scene { name: path.file_stem().unwrap().to_string_lossy().into_owned(), ..Default::default() };
     for m in mats {
-        let p = |v: Option<[f32;3]>| v.map(Vec3::from).unwrap_or_default();
+        let p = |v: Option<[f32; 3]>| v.map(Vec3::from).unwrap_or_default();
         s.materials.push(Material { name: m.name.clone(), diffuse: p(m.diffuse), emission: p(m.emissive) });
     }
     for m in models {
         let base = s.positions.len() as u32;
         s.positions.extend(m.mesh.positions.chunks(3).map(|c| Vec3::new(c[0], c[1], c[2])));
-        for t in m.mesh.indices.chunks(3) { s.triangles.push([t[0]+base,t[1]+base,t[2]+base]); s.triangle_materials.push(m.mesh.material_id.unwrap() as u32); }
+        for t in m.mesh.indices.chunks(3) {
+            s.triangles.push([t[0] + base, t[1] + base, t[2] + base]);
+            s.triangle_materials.push(m.mesh.material_id.unwrap() as u32);
+        }
     }
     let cam = std::fs::read(file.with_file_name("camera.json")).unwrap();
     s.camera = Some(serde_json::from_slice(&cam).unwrap());

@@ -85,7 +85,13 @@ impl<S: Simd> Bvh<'_, S> {
 
 /// The coordinates of up to a vector's width of targets; lanes beyond the last hold anything.
 #[inline(always)]
-fn ends_of<S: Simd>(token: S::Token, all: &[f32], from: usize, count: usize, tail: &mut [f32; 16]) -> S::Packet {
+fn ends_of<S: Simd>(
+    token: S::Token,
+    all: &[f32],
+    from: usize,
+    count: usize,
+    tail: &mut [f32; 16],
+) -> S::Packet {
     if count == S::Packet::WIDTH {
         return S::Packet::load(token, &all[from..]);
     }
