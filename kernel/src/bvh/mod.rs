@@ -12,10 +12,11 @@
 
 mod batch;
 mod packet;
+mod pyramid;
 mod single;
 mod slabs;
 
-pub use batch::Targets;
+pub use batch::{BatchScratch, Targets};
 pub use packet::HitPacket;
 
 use crate::lanes::{Native, Simd};
@@ -225,14 +226,14 @@ impl<'a, S: Simd> Bvh<'a, S> {
     }
 
     /// How far a point must stand off a surface so that no rounding makes it hit that surface, or one in the
-    /// same plane: 16 roundings of the scene's greatest coordinate. For [`offset`].
+    /// same plane: 32 roundings of the scene's greatest coordinate. For [`offset`].
     ///
     /// It covers the error of a point computed on a triangle and the error of the triangle test (see
     /// [`crate::triangle`]; each sheared vertex is off by up to four roundings of its distance from the origin,
     /// which two points of the scene bound by twice the greatest coordinate).
     #[inline]
     pub fn clearance(&self) -> f32 {
-        16.0 * ROUNDING * self.magnitude
+        32.0 * ROUNDING * self.magnitude
     }
 
     /// What bounds are widened by, for a ray from here: all rounding of box and triangle tests.

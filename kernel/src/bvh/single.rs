@@ -200,13 +200,41 @@ impl<S: Simd> Bvh<'_, S> {
         if ray.direction.abs().max_element() < SHORTEST {
             return;
         }
+        self.traverse_below(Child::node(0), ray, axis, ignore, counter, visitor);
+    }
+
+    /// Does anything but `ignore` in this subtree block a ray that can hit something?
+    #[inline(always)]
+    pub(super) fn occluded_below(
+        &self,
+        subtree: Child,
+        ray: &Ray,
+        axis: usize,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> bool {
+        let mut visitor = First { t_max: ray.t_max, found: None };
+        self.traverse_below(subtree, ray, axis, ignore, counter, &mut visitor);
+        visitor.found.is_some()
+    }
+
+    #[inline(always)]
+    fn traverse_below<V: Visitor>(
+        &self,
+        subtree: Child,
+        ray: &Ray,
+        axis: usize,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        visitor: &mut V,
+    ) {
         let token = self.simd.token();
         let slabs = Slabs::<S::Node>::new(token, ray, self.slack(ray.origin));
         let sheared = shear_one(self.simd, ray, axis);
 
         let mut stack = [(Child::NONE, 0.0f32); STACK];
         let mut len = 0;
-        let mut next = Child::node(0);
+        let mut next = subtree;
         let mut entry = [0.0; 8];
         let mut found = Found::NOTHING;
         loop {

@@ -1,0 +1,877 @@
+//! One point and up to 64 targets, asked about all at once.
+//!
+//! With p a position seen from x, three linear functions S, T and W of p are chosen so that the targets lie at
+//! `(s, t) = (S/W, T/W)` in a small rectangle at about one depth W: on a parallelogram light, its own
+//! coordinates. Seen that way a segment is a point (s, t) with a depth w, a triangle abc is three linear forms
+//!
+//! ```text
+//!     E_ab = det(a, b, (s, t, 1)),  E_bc,  E_ca,
+//! ```
+//!
+//! and the segment meets the triangle when all of them have the sign of `V = det(a, b, c)` (which also says that
+//! the triangle lies ahead of x) and `|V| <= w |E_ab + E_bc + E_ca|` (that it lies before the target). Two
+//! multiply-adds a form and target, after a set-up of eight triangles side by side.
+//!
+//! These forms are filters. Their rounding is bounded; a target that is nearer to an edge than the bound is
+//! asked again with the test of [`crate::triangle`]. So the answers are those of a single ray, bit for bit, and
+//! as watertight.
+//!
+//! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by the same bound.
+
+use super::{Bvh, Child, Node, ROUNDING, STACK, Targets};
+use crate::counter::Counter;
+use crate::lanes::{Lanes, Mask, Simd};
+use crate::ray::Ray;
+use crate::triangle::{Axes, Found, Sheared, TriangleBlock, shear_one};
+use crate::vec3x;
+use glam::Vec3;
+
+/// Targets a pyramid takes.
+pub(super) const MOST: usize = 64;
+
+/// Cells an axis of the rectangle is cut into, to tell which targets a box may hide.
+const CELLS: usize = 32;
+
+/// Nodes visited before boxes are asked which targets they may hide: in easy places there is nothing to gain.
+const EASY: u32 = 3;
+
+/// As many targets or fewer are traced one by one.
+const LONE: u32 = 2;
+
+/// A block is tested ray by ray for as many targets or fewer.
+const LEAF_LONE: u32 = 3;
+
+/// Bounds on rounding are this many units of the textbook's first-order bounds.
+const CAUTION: f32 = 2.0;
+
+/// Up to 64 targets as seen from x.
+pub(super) struct Pyramid {
+    x: Vec3,
+    /// The linear functions S, T and W, by rows.
+    rows: [Vec3; 3],
+    /// Directions to the targets, by axis.
+    direction: [[f32; MOST]; 3],
+    /// Targets in the pyramid's coordinates.
+    s: [f32; MOST],
+    t: [f32; MOST],
+    w: [f32; MOST],
+    count: usize,
+    /// For each axis, the targets whose direction is longest along it.
+    along: [u64; 3],
+    /// Least and greatest s, t and w.
+    least: Vec3,
+    greatest: Vec3,
+    /// What position components are off by, and the bounds in S, T and W that follow.
+    rounding: Vec3,
+    /// Greatest distance of anything from x, along an axis.
+    reach: f32,
+    planes: [Plane; 5],
+    /// `before[axis][k]`: targets in the cells before cell `k` of that axis. Filled when first needed.
+    before: [[u64; CELLS + 1]; 2],
+    /// How s and t become cells: `(value - least) * scale`.
+    scale: [f32; 2],
+    /// Directions to the corners of the rectangle at the least and the greatest depth.
+    corners: [Vec3; 8],
+    /// The greatest component of a direction to a target.
+    farthest: f32,
+    /// The box around x and the targets.
+    lower: Vec3,
+    upper: Vec3,
+}
+
+/// Positions with `normal . position + offset >= 0` may be in the pyramid.
+#[derive(Clone, Copy, Default)]
+struct Plane {
+    normal: Vec3,
+    offset: f32,
+    /// Which corner of a box reaches farthest inside, by axis: 0 the least, 1 the greatest.
+    side: [usize; 3],
+}
+
+impl Plane {
+    #[inline(always)]
+    fn new(normal: Vec3, at: f32, x: Vec3, slack: f32) -> Self {
+        Self {
+            normal,
+            offset: at - normal.dot(x) + slack,
+            side: [
+                usize::from(normal.x > 0.0),
+                usize::from(normal.y > 0.0),
+                usize::from(normal.z > 0.0),
+            ],
+        }
+    }
+}
+
+/// Eight triangles as forms, by lane.
+struct Forms {
+    /// The four forms' coefficients of s, t and 1.
+    edges: [[[f32; 8]; 3]; 3],
+    /// `|V|`: what the sum of the edges must reach at depth 1.
+    volume: [f32; 8],
+    /// Above this a form is surely positive, below minus this surely negative.
+    edge_bound: [f32; 8],
+    depth_bound: [f32; 8],
+}
+
+/// What the set-up says of the triangles of a block.
+struct Verdict {
+    /// May block some target.
+    open: u32,
+    /// Blocks every target.
+    all: u32,
+    /// Needs the exact test for every target.
+    unclear: u32,
+    /// May reach beyond a target, so that depth must be tested.
+    deep: u32,
+}
+
+/// The sum of absolute components.
+#[inline(always)]
+fn extent(v: Vec3) -> f32 {
+    let v = v.abs();
+    v.x + v.y + v.z
+}
+
+impl Pyramid {
+    /// `None` where the targets do not lie in one pyramid: on both sides of x, at very different depths, or
+    /// where anything is not finite.
+    #[inline(always)]
+    pub(super) fn new<S: Simd>(
+        simd: S,
+        x: Vec3,
+        targets: &Targets<'_>,
+        from: usize,
+        count: usize,
+        magnitude: f32,
+        scratch: &mut Self,
+    ) -> bool {
+        let token = simd.token();
+        let this = scratch;
+        this.x = x;
+        this.count = count;
+        for axis in 0..3 {
+            let ends = &targets.axis(axis)[from..from + count];
+            let at = x[axis];
+            let directions = &mut this.direction[axis];
+            let mut i = 0;
+            while i < count {
+                directions[i] = ends[i] - at;
+                i += 1;
+            }
+            // Unused lanes repeat the last target, so that no vector holds anything odd.
+            let last = directions[count - 1];
+            let until = count.next_multiple_of(16);
+            while i < until {
+                directions[i] = last;
+                i += 1;
+            }
+        }
+        let Some((rows, columns)) = targets.frame(x, &this.direction, count) else { return false };
+        this.rows = rows;
+        this.reach = magnitude + x.abs().max_element();
+
+        type P<S> = <S as Simd>::Packet;
+        let (first, last) = (P::<S>::splat(token, f32::INFINITY), P::<S>::splat(token, f32::NEG_INFINITY));
+        let (mut low, mut high) = ([first; 3], [last; 3]);
+        let (mut near, mut far) = ([first; 3], [last; 3]);
+        let mut along = [0u64; 3];
+        let mut i = 0;
+        while i < count {
+            let d = [
+                P::<S>::load(token, &this.direction[0][i..]),
+                P::<S>::load(token, &this.direction[1][i..]),
+                P::<S>::load(token, &this.direction[2][i..]),
+            ];
+            let w = dot::<S>(token, rows[2], d);
+            let s = dot::<S>(token, rows[0], d) / w;
+            let t = dot::<S>(token, rows[1], d) / w;
+            s.store(&mut this.s[i..]);
+            t.store(&mut this.t[i..]);
+            w.store(&mut this.w[i..]);
+            let [a, b, c] = vec3x::abs(d);
+            let first = (b.le(a) & c.le(a)).bits();
+            let second = c.le(b).bits() & !first;
+            along[0] |= u64::from(first) << i;
+            along[1] |= u64::from(second) << i;
+            low = [low[0].min(s), low[1].min(t), low[2].min(w)];
+            high = [high[0].max(s), high[1].max(t), high[2].max(w)];
+            near = [near[0].min(d[0]), near[1].min(d[1]), near[2].min(d[2])];
+            far = [far[0].max(d[0]), far[1].max(d[1]), far[2].max(d[2])];
+            i += P::<S>::WIDTH;
+        }
+        let every = u64::MAX >> (64 - count);
+        this.along = [along[0] & every, along[1] & every, !(along[0] | along[1]) & every];
+        let least = Vec3::new(least_of(low[0]), least_of(low[1]), least_of(low[2]));
+        let greatest = Vec3::new(greatest_of(high[0]), greatest_of(high[1]), greatest_of(high[2]));
+        (this.least, this.greatest) = (least, greatest);
+        // Written so that NaN fails.
+        if !(least.z > 0.0 && greatest.z <= 4.0 * least.z && greatest.is_finite() && least.is_finite()) {
+            return false;
+        }
+        let position = 16.0 * ROUNDING * this.reach;
+        this.rounding =
+            Vec3::new(extent(rows[0]), extent(rows[1]), extent(rows[2])) * (CAUTION * position);
+        let slack = |row: Vec3, edge: f32| 4.0 * position * (extent(row) + edge.abs() * extent(rows[2]));
+        let side = |row: Vec3, edge: f32, sign: f32| {
+            Plane::new((row - rows[2] * edge) * sign, 0.0, x, slack(row, edge))
+        };
+        this.planes = [
+            side(rows[0], least.x, 1.0),
+            side(rows[0], greatest.x, -1.0),
+            side(rows[1], least.y, 1.0),
+            side(rows[1], greatest.y, -1.0),
+            Plane::new(-rows[2], greatest.z, x, 4.0 * position * extent(rows[2])),
+        ];
+        let mut k = 0;
+        while k < 8 {
+            let s = if k & 1 == 0 { least.x } else { greatest.x };
+            let t = if k & 2 == 0 { least.y } else { greatest.y };
+            let w = if k & 4 == 0 { least.z } else { greatest.z };
+            this.corners[k] = (columns[0] * s + columns[1] * t + columns[2]) * w;
+            k += 1;
+        }
+        let near = Vec3::new(least_of(near[0]), least_of(near[1]), least_of(near[2])).min(Vec3::ZERO);
+        let far = Vec3::new(greatest_of(far[0]), greatest_of(far[1]), greatest_of(far[2])).max(Vec3::ZERO);
+        this.farthest = far.max(-near).max_element();
+        this.lower = x + near - position;
+        this.upper = x + far + position;
+        true
+    }
+
+    pub(super) const EMPTY: Self = Self {
+        x: Vec3::ZERO,
+        rows: [Vec3::ZERO; 3],
+        direction: [[0.0; MOST]; 3],
+        s: [0.0; MOST],
+        t: [0.0; MOST],
+        w: [0.0; MOST],
+        count: 0,
+        along: [0; 3],
+        least: Vec3::ZERO,
+        greatest: Vec3::ZERO,
+        rounding: Vec3::ZERO,
+        reach: 0.0,
+        planes: [Plane { normal: Vec3::ZERO, offset: 0.0, side: [0; 3] }; 5],
+        before: [[0; CELLS + 1]; 2],
+        scale: [0.0; 2],
+        corners: [Vec3::ZERO; 8],
+        farthest: 0.0,
+        lower: Vec3::ZERO,
+        upper: Vec3::ZERO,
+    };
+
+    /// Which children of a node the pyramid may meet, and how deep each begins.
+    #[inline(always)]
+    fn children<S: Simd>(&self, simd: S, node: &Node, depth: &mut [f32; 8]) -> u32 {
+        type N<S> = <S as Simd>::Node;
+        let token = simd.token();
+        let mut met = 0;
+        let mut from = 0;
+        while from < Node::WIDTH {
+            let bounds = [
+                vec3x::load::<N<S>, 8>(token, &node.bounds[0], from),
+                vec3x::load::<N<S>, 8>(token, &node.bounds[1], from),
+            ];
+            let lower = vec3x::splat::<N<S>>(token, self.lower.to_array());
+            let upper = vec3x::splat::<N<S>>(token, self.upper.to_array());
+            let mut inside = lower[0].le(bounds[1][0]) & bounds[0][0].le(upper[0]);
+            inside = inside & lower[1].le(bounds[1][1]) & bounds[0][1].le(upper[1]);
+            inside = inside & lower[2].le(bounds[1][2]) & bounds[0][2].le(upper[2]);
+            let mut k = 0;
+            let zero = N::<S>::splat(token, 0.0);
+            let mut reach = zero;
+            while k < 5 {
+                let plane = &self.planes[k];
+                let x = bounds[plane.side[0] & 1][0];
+                let y = bounds[plane.side[1] & 1][1];
+                let z = bounds[plane.side[2] & 1][2];
+                reach = x.mul_add(
+                    N::<S>::splat(token, plane.normal.x),
+                    y.mul_add(
+                        N::<S>::splat(token, plane.normal.y),
+                        z.mul_add(N::<S>::splat(token, plane.normal.z), N::<S>::splat(token, plane.offset)),
+                    ),
+                );
+                inside = inside & zero.le(reach);
+                k += 1;
+            }
+            // The last plane looks back from the targets: the deeper inside, the nearer to x.
+            (-reach).store(&mut depth[from..]);
+            met |= inside.bits() << from;
+            from += N::<S>::WIDTH;
+        }
+        met
+    }
+
+    /// Sorts the targets into cells.
+    #[inline(always)]
+    fn sort(&mut self) {
+        let mut axis = 0;
+        while axis < 2 {
+            let (least, greatest) = (self.least[axis], self.greatest[axis]);
+            let width = greatest - least;
+            let scale = if width > 0.0 { CELLS as f32 / width } else { 0.0 };
+            self.scale[axis] = scale;
+            let values = if axis == 0 { &self.s } else { &self.t };
+            let mut cells = [0u64; CELLS];
+            let mut i = 0;
+            while i < self.count {
+                cells[cell((values[i] - least) * scale)] |= 1 << i;
+                i += 1;
+            }
+            let mut sum = 0;
+            let mut k = 0;
+            while k < CELLS {
+                self.before[axis][k] = sum;
+                sum |= cells[k];
+                k += 1;
+            }
+            self.before[axis][CELLS] = sum;
+            axis += 1;
+        }
+    }
+
+    /// Which targets each child of a node may hide, of those it meets.
+    #[inline(always)]
+    fn hidden<S: Simd>(&self, simd: S, node: &Node, mut met: u32, ask: &mut [u64; 8]) {
+        type N<S> = <S as Simd>::Node;
+        let token = simd.token();
+        let one = |value: f32| N::<S>::splat(token, value);
+        let mut ranges = [[0.0f32; 8]; 4];
+        let mut from = 0;
+        let x = vec3x::splat::<N<S>>(token, self.x.to_array());
+        let half = one(0.5);
+        while from < Node::WIDTH {
+            let low = vec3x::load::<N<S>, 8>(token, &node.bounds[0], from);
+            let high = vec3x::load::<N<S>, 8>(token, &node.bounds[1], from);
+            // Unused children hold infinities and come out as NaN; they are not among those met.
+            let centre = [
+                (low[0] + high[0]) * half - x[0],
+                (low[1] + high[1]) * half - x[1],
+                (low[2] + high[2]) * half - x[2],
+            ];
+            let size = [(high[0] - low[0]) * half, (high[1] - low[1]) * half, (high[2] - low[2]) * half];
+            let (s, s_half) = self.span(simd, centre, size, 0);
+            let (t, t_half) = self.span(simd, centre, size, 1);
+            let (w, w_half) = self.span(simd, centre, size, 2);
+            let (near, far) = (w - w_half, w + w_half);
+            let zero = one(0.0);
+            let ahead = zero.lt(near);
+            let (by_near, by_far) = (one(1.0) / near, one(1.0) / far);
+            let mut axis = 0;
+            while axis < 2 {
+                let (centre, size) = if axis == 0 { (s, s_half) } else { (t, t_half) };
+                let (least, most) = (centre - size, centre + size);
+                let (least, scale) = (
+                    (least * by_near).min(least * by_far),
+                    (one(self.least[axis]), one(self.scale[axis])),
+                );
+                let most = (most * by_near).max(most * by_far);
+                let (low, high) = ((least - scale.0) * scale.1, (most - scale.0) * scale.1);
+                let last = one(CELLS as f32 - 1.0);
+                // Rounding of the last steps, in cells.
+                let slip = one(1e-3);
+                N::<S>::select(ahead, low - slip, zero).max(zero).min(last).store(&mut ranges[2 * axis][from..]);
+                N::<S>::select(ahead, high + slip, last).max(zero).min(last).store(&mut ranges[2 * axis + 1][from..]);
+                axis += 1;
+            }
+            from += N::<S>::WIDTH;
+        }
+        while met != 0 {
+            let place = met.trailing_zeros() as usize & 7;
+            met &= met - 1;
+            let [s, t] = &self.before;
+            let within_s = s[cell(ranges[1][place]) + 1] & !s[cell(ranges[0][place])];
+            let within_t = t[cell(ranges[3][place]) + 1] & !t[cell(ranges[2][place])];
+            ask[place] = within_s & within_t;
+        }
+    }
+
+    /// The middle and the half width of a linear function over boxes, widened by its rounding.
+    #[inline(always)]
+    fn span<S: Simd>(&self, simd: S, centre: [S::Node; 3], size: [S::Node; 3], k: usize) -> (S::Node, S::Node) {
+        let [x, y, z] = vec3x::splat::<S::Node>(simd.token(), self.rows[k].abs().to_array());
+        let half = size[0].mul_add(x, size[1].mul_add(y, size[2] * z));
+        (self.row(simd, centre, k), half + S::Node::splat(simd.token(), self.rounding[k]))
+    }
+
+    /// The ray to a target.
+    #[inline(always)]
+    fn ray(&self, i: usize) -> Ray {
+        let i = i & (MOST - 1);
+        let direction = Vec3::new(self.direction[0][i], self.direction[1][i], self.direction[2][i]);
+        Ray { origin: self.x, direction, t_min: 0.0, t_max: 1.0 }
+    }
+
+    /// The dominant axis of the ray to a target.
+    #[inline(always)]
+    fn axis(&self, i: usize) -> usize {
+        if self.along[0] >> i & 1 != 0 {
+            0
+        } else if self.along[1] >> i & 1 != 0 {
+            1
+        } else {
+            2
+        }
+    }
+
+    /// Turns the triangles of a block into forms and says what is clear already.
+    #[inline(always)]
+    fn set_up<S: Simd>(&self, simd: S, block: &TriangleBlock, forms: &mut Forms) -> Verdict {
+        let token = simd.token();
+        let mut verdict = Verdict { open: 0, all: 0, unclear: 0, deep: 0 };
+        let mut from = 0;
+        while from < TriangleBlock::WIDTH {
+            self.set_up_lanes(token, simd, block, from, forms, &mut verdict);
+            from += S::Node::WIDTH;
+        }
+        verdict
+    }
+
+    #[inline(always)]
+    fn set_up_lanes<S: Simd>(
+        &self,
+        token: S::Token,
+        simd: S,
+        block: &TriangleBlock,
+        from: usize,
+        forms: &mut Forms,
+        verdict: &mut Verdict,
+    ) {
+        type N<S> = <S as Simd>::Node;
+        let one = |value: f32| N::<S>::splat(token, value);
+        let zero = one(0.0);
+        let x = vec3x::splat::<N<S>>(token, self.x.to_array());
+        // Positions from x: the same differences, with the same rounding, as in the exact test.
+        let a = vec3x::sub(vec3x::load(token, &block.vertices[0], from), x);
+        let b = vec3x::sub(vec3x::load(token, &block.vertices[1], from), x);
+        let c = vec3x::sub(vec3x::load(token, &block.vertices[2], from), x);
+        let from_x = [a, b, c];
+        let a = self.project(simd, a);
+        let b = self.project(simd, b);
+        let c = self.project(simd, c);
+
+        // A side of the pyramid, widened, with all three vertices behind it.
+        let [ds, dt, dw] = [one(self.rounding.x), one(self.rounding.y), one(self.rounding.z)];
+        let deepest = a[2].max(b[2]).max(c[2]);
+        let nearest = a[2].min(b[2]).min(c[2]);
+        let (s0, s1) = (one(self.least.x), one(self.greatest.x));
+        let (t0, t1) = (one(self.least.y), one(self.greatest.y));
+        let (w0, w1) = (one(self.least.z), one(self.greatest.z));
+        let (far_s, far_t) = (s0.abs().max(s1.abs()), t0.abs().max(t1.abs()));
+        let (wide_s, wide_t) = (dw.mul_add(far_s, ds), dw.mul_add(far_t, dt));
+        let mut open = (-wide_s).le(beyond(a, s0, 0).max(beyond(b, s0, 0)).max(beyond(c, s0, 0)));
+        open = open & (-wide_s).le(short(a, s1, 0).max(short(b, s1, 0)).max(short(c, s1, 0)));
+        open = open & (-wide_t).le(beyond(a, t0, 1).max(beyond(b, t0, 1)).max(beyond(c, t0, 1)));
+        open = open & (-wide_t).le(short(a, t1, 1).max(short(b, t1, 1)).max(short(c, t1, 1)));
+        open = open & (-dw).le(deepest) & nearest.le(w1 + dw);
+        if !open.any() {
+            return;
+        }
+
+        // Planes with x and all targets on one side, from unscaled positions: the surface x lies on and the
+        // light's own plane are told from things in between by the clearance alone.
+        open = open & self.crosses(simd, from_x);
+        let mut left = open.bits();
+        if left == 0 {
+            return;
+        }
+
+        let (ab, bc, ca) = (cross(a, b), cross(b, c), cross(c, a));
+        let volume = ab[0] * c[0] + ab[1] * c[1] + ab[2] * c[2];
+
+        // First-order bounds: each component of a vertex off by its rounding, and the products by theirs.
+        let big_s = a[0].abs().max(b[0].abs()).max(c[0].abs());
+        let big_t = a[1].abs().max(b[1].abs()).max(c[1].abs());
+        let big_w = a[2].abs().max(b[2].abs()).max(c[2].abs());
+        let deep = one(1.0) + big_w * one(1.0 / self.least.z);
+        let bound = ds * (big_t * deep + far_t * big_w)
+            + dt * (big_s * deep + far_s * big_w)
+            + dw * (far_s * big_t + far_t * big_s);
+        let bound = bound * one(4.0);
+        let volume_bound = ds * big_t * big_w + dt * big_s * big_w + dw * big_s * big_t;
+        let volume_bound = volume_bound * one(6.0);
+        let sign = N::<S>::select(volume.lt(zero), one(-1.0), one(1.0));
+        let volume = volume.abs();
+
+        // Each form over the rectangle: nowhere positive, or everywhere.
+        let (ab, bc, ca) = (scale(ab, sign), scale(bc, sign), scale(ca, sign));
+        let high = highest(ab, s0, s1, t0, t1).min(highest(bc, s0, s1, t0, t1));
+        let high = high.min(highest(ca, s0, s1, t0, t1));
+        let low = lowest(ab, s0, s1, t0, t1).min(lowest(bc, s0, s1, t0, t1));
+        let low = low.min(lowest(ca, s0, s1, t0, t1));
+        let some = (-bound).le(high);
+        let every = bound.lt(low);
+        // Beyond every target, or before all of them.
+        let sum = [ab[0] + bc[0] + ca[0], ab[1] + bc[1] + ca[1], ab[2] + bc[2] + ca[2]];
+        let depth_bound = volume_bound + bound * one(3.0) * w1;
+        let (low_sum, high_sum) = (lowest(sum, s0, s1, t0, t1), highest(sum, s0, s1, t0, t1));
+        let reached = volume.le((high_sum * w1).max(high_sum * w0) + depth_bound);
+        let before = (volume + depth_bound).lt((low_sum * w0).min(low_sum * w1)) | deepest.lt(w0 - dw);
+
+        let known = volume_bound.lt(volume).bits();
+        left &= !known | (some & reached).bits();
+        if left == 0 {
+            return;
+        }
+        let before = before.bits() & known;
+        verdict.open |= left << from;
+        verdict.all |= (left & before & every.bits()) << from;
+        verdict.unclear |= (left & !known) << from;
+        verdict.deep |= (left & !before) << from;
+        let mut k = 0;
+        while k < 3 {
+            ab[k].store(&mut forms.edges[0][k][from..]);
+            bc[k].store(&mut forms.edges[1][k][from..]);
+            ca[k].store(&mut forms.edges[2][k][from..]);
+            k += 1;
+        }
+        volume.store(&mut forms.volume[from..]);
+        bound.store(&mut forms.edge_bound[from..]);
+        depth_bound.store(&mut forms.depth_bound[from..]);
+    }
+
+    /// Triangles, by their vertices from x, whose planes may pass between x and a target.
+    #[inline(always)]
+    fn crosses<S: Simd>(&self, simd: S, [a, b, c]: [[S::Node; 3]; 3]) -> <S::Node as Lanes>::Mask {
+        let token = simd.token();
+        let (e, f) = (vec3x::sub(b, a), vec3x::sub(c, a));
+        let (e_size, f_size) = (vec3x::abs(e), vec3x::abs(f));
+        let n = cross(e, f);
+        // What the products of the normal are at most, and so what its rounding goes by.
+        let n_size = (e_size[1] * f_size[2] + e_size[2] * f_size[1])
+            + (e_size[2] * f_size[0] + e_size[0] * f_size[2])
+            + (e_size[0] * f_size[1] + e_size[1] * f_size[0]);
+        let far = vec3x::most(vec3x::abs(a)).max(vec3x::most(vec3x::abs(b))).max(vec3x::most(vec3x::abs(c)));
+        let far = far.max(S::Node::splat(token, self.farthest));
+        let bound = n_size * far * S::Node::splat(token, 8.0 * ROUNDING);
+        let plane = n[0] * a[0] + n[1] * a[1] + n[2] * a[2];
+        let mut low = S::Node::splat(token, 0.0);
+        let mut high = low;
+        let mut k = 0;
+        while k < 8 {
+            let d = self.corners[k];
+            let at = n[0].mul_add(
+                S::Node::splat(token, d.x),
+                n[1].mul_add(S::Node::splat(token, d.y), n[2] * S::Node::splat(token, d.z)),
+            );
+            (low, high) = (low.min(at), high.max(at));
+            k += 1;
+        }
+        // `low` and `high` start at 0, where x is.
+        (low - bound).le(plane) & plane.le(high + bound)
+    }
+
+    /// A position in the pyramid's coordinates.
+    #[inline(always)]
+    fn project<S: Simd>(&self, simd: S, p: [S::Node; 3]) -> [S::Node; 3] {
+        [self.row(simd, p, 0), self.row(simd, p, 1), self.row(simd, p, 2)]
+    }
+
+    #[inline(always)]
+    fn row<S: Simd>(&self, simd: S, p: [S::Node; 3], k: usize) -> S::Node {
+        let [x, y, z] = vec3x::splat::<S::Node>(simd.token(), self.rows[k].to_array());
+        p[0].mul_add(x, p[1].mul_add(y, p[2] * z))
+    }
+
+    /// Which targets of `ask` the triangle of a lane blocks.
+    #[inline(always)]
+    fn test<S: Simd>(
+        &self,
+        simd: S,
+        forms: &Forms,
+        block: &TriangleBlock,
+        lane: usize,
+        deep: bool,
+        ask: u64,
+    ) -> u64 {
+        type P<S> = <S as Simd>::Packet;
+        let token = simd.token();
+        let one = |value: f32| P::<S>::splat(token, value);
+        let e = [
+            [one(forms.edges[0][0][lane]), one(forms.edges[0][1][lane]), one(forms.edges[0][2][lane])],
+            [one(forms.edges[1][0][lane]), one(forms.edges[1][1][lane]), one(forms.edges[1][2][lane])],
+            [one(forms.edges[2][0][lane]), one(forms.edges[2][1][lane]), one(forms.edges[2][2][lane])],
+        ];
+        let bound = one(forms.edge_bound[lane]);
+        let volume = one(forms.volume[lane]);
+        let depth_bound = one(forms.depth_bound[lane]);
+        let width = (1u64 << P::<S>::WIDTH) - 1;
+        let mut blocked = 0;
+        let mut i = 0;
+        while i < self.count {
+            let asked = ask >> i & width;
+            if asked != 0 {
+                let s = P::<S>::load(token, &self.s[i..]);
+                let t = P::<S>::load(token, &self.t[i..]);
+                let ab = s.mul_add(e[0][0], t.mul_add(e[0][1], e[0][2]));
+                let bc = s.mul_add(e[1][0], t.mul_add(e[1][1], e[1][2]));
+                let ca = s.mul_add(e[2][0], t.mul_add(e[2][1], e[2][2]));
+                let inner = ab.min(bc).min(ca);
+                let mut sure = bound.lt(inner);
+                let mut maybe = (-bound).le(inner);
+                if deep {
+                    let w = P::<S>::load(token, &self.w[i..]);
+                    let spare = (ab + bc + ca) * w - volume;
+                    sure = sure & depth_bound.lt(spare);
+                    maybe = maybe & (-depth_bound).le(spare);
+                }
+                let sure = u64::from(sure.bits()) & asked;
+                let unsure = u64::from(maybe.bits()) & asked & !sure;
+                blocked |= sure << i;
+                if unsure != 0 {
+                    blocked |= self.exact(simd, block, lane, i, unsure) << i;
+                }
+            }
+            i += P::<S>::WIDTH;
+        }
+        blocked
+    }
+
+    /// The exact test of targets `i` on, those of `ask`.
+    #[inline(always)]
+    fn exact<S: Simd>(&self, simd: S, block: &TriangleBlock, lane: usize, i: usize, ask: u64) -> u64 {
+        let token = simd.token();
+        let direction = [
+            S::Packet::load(token, &self.direction[0][i..]),
+            S::Packet::load(token, &self.direction[1][i..]),
+            S::Packet::load(token, &self.direction[2][i..]),
+        ];
+        let origin = vec3x::splat(token, self.x.to_array());
+        let triangle = [
+            vec3x::broadcast(token, &block.vertices[0], lane),
+            vec3x::broadcast(token, &block.vertices[1], lane),
+            vec3x::broadcast(token, &block.vertices[2], lane),
+        ];
+        let (begin, end) = (S::Packet::splat(token, 0.0), S::Packet::splat(token, 1.0));
+        let mut blocked = 0;
+        let mut axis = 0;
+        while axis < 3 {
+            let asked = ask & (self.along[axis] >> i);
+            if asked != 0 {
+                let sheared = Sheared::new(token, Axes::of(axis), origin, direction, begin, end);
+                blocked |= u64::from(sheared.cross(token, triangle).hit.bits()) & asked;
+            }
+            axis += 1;
+        }
+        blocked
+    }
+}
+
+/// The cell of a scaled coordinate; what lies outside goes to the first or the last.
+#[inline(always)]
+fn cell(at: f32) -> usize {
+    (at as usize).min(CELLS - 1)
+}
+
+#[inline(always)]
+fn cross<L: Lanes>(p: [L; 3], q: [L; 3]) -> [L; 3] {
+    [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
+}
+
+#[inline(always)]
+fn scale<L: Lanes>(v: [L; 3], by: L) -> [L; 3] {
+    [v[0] * by, v[1] * by, v[2] * by]
+}
+
+/// How far a vertex is beyond the plane where coordinate `k` over depth is `at`.
+#[inline(always)]
+fn beyond<L: Lanes>(v: [L; 3], at: L, k: usize) -> L {
+    v[k] - v[2] * at
+}
+
+/// How far it is short of that plane.
+#[inline(always)]
+fn short<L: Lanes>(v: [L; 3], at: L, k: usize) -> L {
+    v[2] * at - v[k]
+}
+
+/// The least value of a form over a rectangle.
+#[inline(always)]
+fn lowest<L: Lanes>(e: [L; 3], s0: L, s1: L, t0: L, t1: L) -> L {
+    (e[0] * s0).min(e[0] * s1) + (e[1] * t0).min(e[1] * t1) + e[2]
+}
+
+/// The greatest value of a form over a rectangle.
+#[inline(always)]
+fn highest<L: Lanes>(e: [L; 3], s0: L, s1: L, t0: L, t1: L) -> L {
+    (e[0] * s0).max(e[0] * s1) + (e[1] * t0).max(e[1] * t1) + e[2]
+}
+
+#[inline(always)]
+fn dot<S: Simd>(token: S::Token, row: Vec3, d: [S::Packet; 3]) -> S::Packet {
+    let [x, y, z] = vec3x::splat::<S::Packet>(token, row.to_array());
+    d[0].mul_add(x, d[1].mul_add(y, d[2] * z))
+}
+
+#[inline(always)]
+fn least_of<L: Lanes>(v: L) -> f32 {
+    let mut lanes = [f32::INFINITY; 16];
+    v.store(&mut lanes);
+    let mut least = lanes[0];
+    let mut i = 1;
+    while i < L::WIDTH {
+        least = if lanes[i] < least { lanes[i] } else { least };
+        i += 1;
+    }
+    least
+}
+
+#[inline(always)]
+fn greatest_of<L: Lanes>(v: L) -> f32 {
+    -least_of(-v)
+}
+
+impl<S: Simd> Bvh<'_, S> {
+    /// Which of the pyramid's targets anything but `ignore` blocks.
+    #[inline(always)]
+    pub(super) fn pyramid_blocked(
+        &self,
+        pyramid: &mut Pyramid,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> u64 {
+        let simd = self.simd;
+        let token = simd.token();
+        let every = u64::MAX >> (64 - pyramid.count);
+        let mut free = every;
+        counter.rays(pyramid.count as u32);
+        let mut forms = Forms {
+            edges: [[[0.0; 8]; 3]; 3],
+            volume: [0.0; 8],
+            edge_bound: [0.0; 8],
+            depth_bound: [0.0; 8],
+        };
+        let mut found = Found::NOTHING;
+        let mut stack = [(Child::NONE, 0.0f32, 0u64); STACK];
+        let mut len = 0;
+        let (mut visits, mut sorted) = (0, false);
+        let (mut next, mut may) = (Child::node(0), every);
+        let mut depth = [0.0; 8];
+        let mut hides = [every; 8];
+        loop {
+            let ask = may & free;
+            if ask == 0 {
+                // Nothing left that this part could hide.
+            } else if next.is_leaf() {
+                let block = &self.blocks[next.index()];
+                if ask.count_ones() <= LEAF_LONE {
+                    let mut rest = ask;
+                    while rest != 0 {
+                        let i = rest.trailing_zeros() as usize;
+                        rest &= rest - 1;
+                        let sheared = shear_one(simd, &pyramid.ray(i), pyramid.axis(i));
+                        counter.triangle_tests(block.len() as u32);
+                        let mut hits = sheared.cross_block(token, block, &mut found);
+                        while hits != 0 {
+                            let lane = hits.trailing_zeros() as usize & 7;
+                            hits &= hits - 1;
+                            if super::counts(block.ids[lane], ignore) {
+                                free &= !(1 << i);
+                            }
+                        }
+                    }
+                } else {
+                    free &= !self.block_blocked(pyramid, block, &mut forms, ask, ignore, counter);
+                }
+                if free == 0 {
+                    return every;
+                }
+            } else if ask.count_ones() <= LONE && visits > EASY {
+                let mut rest = ask;
+                while rest != 0 {
+                    let i = rest.trailing_zeros() as usize;
+                    rest &= rest - 1;
+                    if self.occluded_below(next, &pyramid.ray(i), pyramid.axis(i), ignore, counter) {
+                        free &= !(1 << i);
+                    }
+                }
+                if free == 0 {
+                    return every;
+                }
+            } else {
+                let node = &self.nodes[next.index()];
+                counter.node_tests(node.len());
+                let mut met = pyramid.children(simd, node, &mut depth);
+                if visits >= EASY && met != 0 {
+                    if !sorted {
+                        pyramid.sort();
+                        sorted = true;
+                    }
+                    pyramid.hidden(simd, node, met, &mut hides);
+                }
+                visits += u32::from(visits <= EASY);
+                let first = len;
+                while met != 0 {
+                    let place = met.trailing_zeros() as usize & 7;
+                    met &= met - 1;
+                    let (child, at, may) = (node.children[place], depth[place], hides[place] & ask);
+                    if may == 0 {
+                        continue;
+                    }
+                    let mut slot = len;
+                    while slot > first && stack[slot - 1].1 < at {
+                        stack[slot] = stack[slot - 1];
+                        slot -= 1;
+                    }
+                    stack[slot] = (child, at, may);
+                    len += 1;
+                }
+            }
+            if len == 0 {
+                return every & !free;
+            }
+            len -= 1;
+            (next, _, may) = stack[len];
+        }
+    }
+
+    /// Which targets of `ask` the triangles of a block hide.
+    #[inline(always)]
+    fn block_blocked(
+        &self,
+        pyramid: &Pyramid,
+        block: &TriangleBlock,
+        forms: &mut Forms,
+        ask: u64,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> u64 {
+        let simd = self.simd;
+        let verdict = pyramid.set_up(simd, block, forms);
+        let mut blocked = 0;
+        let mut open = verdict.open;
+        while open != 0 {
+            let lane = open.trailing_zeros() as usize & 7;
+            open &= open - 1;
+            let id = block.ids[lane];
+            if id == crate::triangle::NO_TRIANGLE || !super::counts(id, ignore) {
+                continue;
+            }
+            if verdict.all >> lane & 1 != 0 {
+                counter.triangle_tests(1);
+                return u64::MAX;
+            }
+            let ask = ask & !blocked;
+            counter.triangle_tests(ask.count_ones());
+            if verdict.unclear >> lane & 1 != 0 {
+                let mut i = 0;
+                while i < pyramid.count {
+                    let asked = ask >> i & ((1 << S::Packet::WIDTH) - 1);
+                    if asked != 0 {
+                        blocked |= pyramid.exact(simd, block, lane, i, asked) << i;
+                    }
+                    i += S::Packet::WIDTH;
+                }
+            } else {
+                let deep = verdict.deep >> lane & 1 != 0;
+                blocked |= pyramid.test(simd, forms, block, lane, deep, ask);
+            }
+            if ask & !blocked == 0 {
+                break;
+            }
+        }
+        blocked
+    }
+}
