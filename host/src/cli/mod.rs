@@ -1,0 +1,3 @@
+//! The commands of the `occlude` program.
+
+pub mod generate;
