@@ -4,6 +4,7 @@ pub mod accel;
 pub mod cli;
 pub mod error;
 pub mod film;
+pub mod generate;
 pub mod integrator;
 pub mod light;
 pub mod mesh;

@@ -17,6 +17,9 @@
 //! an edge function is zero; counting zero as inside makes that unnecessary.) A triangle seen exactly edge-on
 //! (`U = V = W = 0`) is missed; its neighbours share the edges and answer in its place.
 //!
+//! Where along the ray is another question, and asked only where a lane is inside: `t = n (a - o) / n d` with the
+//! normal n of the triangle's own edges, held between the t of the vertices.
+//!
 //! All of it is single operations in a fixed order, so every width gives the same answer bit for bit.
 
 use crate::lanes::{Lanes, Mask, Simd};
@@ -113,15 +116,17 @@ impl Axes {
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sheared<L> {
     pub(crate) axes: Axes,
-    /// The origin, by world axis.
+    /// By world axis.
     pub(crate) origin: Vec3x<L>,
+    /// By world axis.
+    pub(crate) direction: Vec3x<L>,
     /// How x and y move for a step along z, and how far t does.
-    pub(crate) shear: [L; 3],
+    pub(crate) shear: Vec3x<L>,
     pub(crate) t_min: L,
     pub(crate) t_max: L,
 }
 
-/// What the test leaves behind: who was hit, and `t`, `u` and `v` scaled by the determinant.
+/// What the test leaves behind: who was hit and where; `u` and `v` scaled by the determinant.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Crossing<L: Lanes> {
     pub(crate) hit: L::Mask,
@@ -144,7 +149,7 @@ impl<L: Lanes> Sheared<L> {
     ) -> Self {
         let z = direction[axes.z];
         let shear = [direction[axes.x] / z, direction[axes.y] / z, L::splat(token, 1.0) / z];
-        Self { axes, origin, shear, t_min, t_max }
+        Self { axes, origin, direction, shear, t_min, t_max }
     }
 
     /// A vertex with the ray's origin at 0 and the ray along z.
@@ -167,15 +172,23 @@ impl<L: Lanes> Sheared<L> {
         let v = a[0] * c[1] - a[1] * c[0];
         let w = b[0] * a[1] - b[1] * a[0];
         let det = u + v + w;
-        // Weights of one sign: no cancellation in `det`, and t lies between the vertices' depths.
-        let t = self.shear[2] * (u * a[2] + v * b[2] + w * c[2]);
-
         let zero = L::splat(token, 0.0);
-        let (first, last) = (self.t_min * det, self.t_max * det);
-        let front = zero.le(u) & zero.le(v) & zero.le(w) & first.lt(t) & t.le(last);
-        let back = u.le(zero) & v.le(zero) & w.le(zero) & t.lt(first) & last.le(t);
-        // With a determinant of zero t is zero too, and neither strict comparison holds.
-        Crossing { hit: front | back, det, t, u: v, v: w }
+        let front = zero.le(u) & zero.le(v) & zero.le(w) & zero.lt(det);
+        let back = u.le(zero) & v.le(zero) & w.le(zero) & det.lt(zero);
+        let inside = front | back;
+        if !inside.any() {
+            return Crossing { hit: inside, det, t: zero, u: v, v: w };
+        }
+        // Where the line crosses the plane. The weights would give t too, but for long thin triangles they are
+        // small differences of large products, and t is off by more than a point is moved off its surface.
+        let n = vec3x::cross(vec3x::sub(triangle[1], triangle[0]), vec3x::sub(triangle[2], triangle[0]));
+        let t = vec3x::dot(n, vec3x::sub(triangle[0], self.origin)) / vec3x::dot(n, self.direction);
+        // Seen edge-on that is a quotient of rounding errors, but t lies between those of the vertices.
+        let [a, b, c] = [a[2] * self.shear[2], b[2] * self.shear[2], c[2] * self.shear[2]];
+        let (first, last) = (a.min(b).min(c), a.max(b).max(c));
+        let t = L::select(first.le(t), t, first);
+        let t = L::select(t.le(last), t, last);
+        Crossing { hit: inside & self.t_min.lt(t) & t.le(self.t_max), det, t, u: v, v: w }
     }
 }
 
@@ -221,7 +234,7 @@ impl Found {
     #[inline(always)]
     pub(crate) fn hit(&self, lane: usize, triangle: u32) -> crate::Hit {
         let det = self.det[lane];
-        crate::Hit { t: self.t[lane] / det, u: self.u[lane] / det, v: self.v[lane] / det, triangle }
+        crate::Hit { t: self.t[lane], u: self.u[lane] / det, v: self.v[lane] / det, triangle }
     }
 }
 
@@ -242,6 +255,7 @@ pub(crate) fn shear_one<S: Simd>(simd: S, ray: &crate::Ray, axis: usize) -> Shea
     Sheared {
         axes,
         origin: vec3x::splat(token, ray.origin.to_array()),
+        direction: vec3x::splat(token, ray.direction.to_array()),
         shear: vec3x::splat(token, [ray.direction[axes.x] / z, ray.direction[axes.y] / z, 1.0 / z]),
         t_min: S::Node::splat(token, ray.t_min),
         t_max: S::Node::splat(token, ray.t_max),

@@ -47,3 +47,15 @@ pub(crate) fn abs<L: Lanes>(v: Vec3x<L>) -> Vec3x<L> {
 pub(crate) fn most<L: Lanes>(v: Vec3x<L>) -> L {
     v[0].max(v[1]).max(v[2])
 }
+
+/// The cross product, each product rounded.
+#[inline(always)]
+pub(crate) fn cross<L: Lanes>(a: Vec3x<L>, b: Vec3x<L>) -> Vec3x<L> {
+    [a[1] * b[2] - a[2] * b[1], a[2] * b[0] - a[0] * b[2], a[0] * b[1] - a[1] * b[0]]
+}
+
+/// The scalar product, each product rounded.
+#[inline(always)]
+pub(crate) fn dot<L: Lanes>(a: Vec3x<L>, b: Vec3x<L>) -> L {
+    a[0] * b[0] + a[1] * b[1] + a[2] * b[2]
+}

@@ -1,7 +1,7 @@
 //! The command `occlude`.
 
 pub mod compare;
-//pub mod generate;
+pub mod generate;
 pub mod info;
 pub mod render;
 
@@ -31,8 +31,8 @@ enum Command {
     Info(info::InfoArgs),
     /// Compare two images: error, bias, FLIP.
     Compare(compare::CompareArgs),
-    //    /// Write a scene of any size.
-    //Generate(generate::GenerateArgs),
+    /// Write a scene of any size.
+    Generate(generate::GenerateArgs),
 }
 
 /// A SIMD level of this CPU.
@@ -63,7 +63,7 @@ pub fn run() -> ExitCode {
         Command::Render(args) => render::run(args, level),
         Command::Info(args) => info::run(args, level).map(|()| Ended::Done),
         Command::Compare(args) => compare::run(args).map(|()| Ended::Done),
-        //        Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
+        Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
     };
     match ended {
         Ok(Ended::Done) => ExitCode::SUCCESS,

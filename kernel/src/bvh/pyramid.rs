@@ -478,7 +478,7 @@ impl Pyramid {
             return;
         }
 
-        let (ab, bc, ca) = (cross(a, b), cross(b, c), cross(c, a));
+        let (ab, bc, ca) = (vec3x::cross(a, b), vec3x::cross(b, c), vec3x::cross(c, a));
         let volume = ab[0] * c[0] + ab[1] * c[1] + ab[2] * c[2];
 
         // First-order bounds: each component of a vertex off by its rounding, and the products by theirs.
@@ -508,7 +508,7 @@ impl Pyramid {
         let depth_bound = volume_bound + bound * one(3.0) * w1;
         let (low_sum, high_sum) = (lowest(sum, s0, s1, t0, t1), highest(sum, s0, s1, t0, t1));
         let reached = volume.le((high_sum * w1).max(high_sum * w0) + depth_bound);
-        let before = (volume + depth_bound).lt((low_sum * w0).min(low_sum * w1)) | deepest.lt(w0 - dw);
+        let before = (volume + depth_bound).lt((low_sum * w0).min(low_sum * w1)) | deepest.lt(w0 * one(0.5));
 
         let known = volume_bound.lt(volume).bits();
         left &= !known | (some & reached).bits();
@@ -538,7 +538,7 @@ impl Pyramid {
         let token = simd.token();
         let (e, f) = (vec3x::sub(b, a), vec3x::sub(c, a));
         let (e_size, f_size) = (vec3x::abs(e), vec3x::abs(f));
-        let n = cross(e, f);
+        let n = vec3x::cross(e, f);
         // What the products of the normal are at most, and so what its rounding goes by.
         let n_size = (e_size[1] * f_size[2] + e_size[2] * f_size[1])
             + (e_size[2] * f_size[0] + e_size[0] * f_size[2])
@@ -546,7 +546,7 @@ impl Pyramid {
         let far = vec3x::most(vec3x::abs(a)).max(vec3x::most(vec3x::abs(b))).max(vec3x::most(vec3x::abs(c)));
         let far = far.max(S::Node::splat(token, self.farthest));
         let bound = n_size * far * S::Node::splat(token, 8.0 * ROUNDING);
-        let plane = n[0] * a[0] + n[1] * a[1] + n[2] * a[2];
+        let plane = vec3x::dot(n, a);
         let mut low = S::Node::splat(token, 0.0);
         let mut high = low;
         let mut k = 0;
@@ -663,11 +663,6 @@ impl Pyramid {
 #[inline(always)]
 fn cell(at: f32) -> usize {
     (at as usize).min(CELLS - 1)
-}
-
-#[inline(always)]
-fn cross<L: Lanes>(p: [L; 3], q: [L; 3]) -> [L; 3] {
-    [p[1] * q[2] - p[2] * q[1], p[2] * q[0] - p[0] * q[2], p[0] * q[1] - p[1] * q[0]]
 }
 
 #[inline(always)]
