@@ -802,7 +802,7 @@ impl<S: Simd> Bvh<'_, S> {
                     let place = met.trailing_zeros() as usize & 7;
                     met &= met - 1;
                     let (child, at, may) = (node.children[place], depth[place], hides[place] & ask);
-                    if may == 0 {
+                    if may == 0 || child == Child::NONE {
                         continue;
                     }
                     let mut slot = len;

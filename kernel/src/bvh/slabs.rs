@@ -7,7 +7,6 @@
 use super::Node;
 use crate::lanes::{Lanes, Mask};
 use crate::vec3x::{self, Vec3x};
-use glam::Vec3;
 
 /// Below this length a direction counts as zero.
 pub(super) const SHORTEST: f32 = 1e-27;
@@ -15,6 +14,10 @@ pub(super) const SHORTEST: f32 = 1e-27;
 /// Components smaller than this part of the longest are taken as that: over the length of a scene the ray moves
 /// by less than the slack.
 const FLATTEST: f32 = 1e-9;
+
+/// Where slack, inverse and their product must lie. Beyond, a plane's product could overflow (planes and origin
+/// are within `2^20` slacks of 0) or lose digits to underflow, and the axis culls nothing.
+const SOUND: [f32; 2] = [f32::MIN_POSITIVE, 1e31];
 
 /// One ray in every lane, for the boxes of a node's children.
 #[derive(Clone, Copy, Debug)]
@@ -38,22 +41,32 @@ impl<L: Lanes> Slabs<L> {
     #[inline(always)]
     pub(super) fn new(token: L::Token, ray: &crate::Ray, slack: f32) -> Self {
         let longest = ray.direction.abs().max_element();
-        let inverse = Vec3::new(
-            inverse(ray.direction.x, longest),
-            inverse(ray.direction.y, longest),
-            inverse(ray.direction.z, longest),
-        );
-        let (back, wide) = (-ray.origin * inverse, slack * inverse.abs());
+        let (x_inverse, x_near, x_far) = Self::axis(ray.origin.x, ray.direction.x, longest, slack);
+        let (y_inverse, y_near, y_far) = Self::axis(ray.origin.y, ray.direction.y, longest, slack);
+        let (z_inverse, z_near, z_far) = Self::axis(ray.origin.z, ray.direction.z, longest, slack);
         Self {
-            inverse: vec3x::splat(token, inverse.to_array()),
-            near: vec3x::splat(token, (back - wide).to_array()),
-            far: vec3x::splat(token, (back + wide).to_array()),
+            inverse: vec3x::splat(token, [x_inverse, y_inverse, z_inverse]),
+            near: vec3x::splat(token, [x_near, y_near, z_near]),
+            far: vec3x::splat(token, [x_far, y_far, z_far]),
             near_side: [
-                usize::from(inverse.x < 0.0),
-                usize::from(inverse.y < 0.0),
-                usize::from(inverse.z < 0.0),
+                usize::from(x_inverse < 0.0),
+                usize::from(y_inverse < 0.0),
+                usize::from(z_inverse < 0.0),
             ],
             t_min: L::splat(token, ray.t_min),
+        }
+    }
+
+    /// The inverse, and the constants of near and far planes, of one axis.
+    #[inline(always)]
+    fn axis(origin: f32, direction: f32, longest: f32, slack: f32) -> (f32, f32, f32) {
+        let inverse = inverse(direction, longest);
+        let (back, wide) = (-origin * inverse, slack * inverse.abs());
+        let [least, most] = SOUND;
+        if slack > least && inverse.abs() > least && wide > least && wide < most {
+            (inverse, back - wide, back + wide)
+        } else {
+            (0.0, f32::NEG_INFINITY, f32::INFINITY)
         }
     }
 
@@ -118,7 +131,14 @@ impl<L: Lanes> PacketSlabs<L> {
         let flat = L::select(direction.lt(L::splat(token, 0.0)), -least, least);
         let inverse = L::splat(token, 1.0) / L::select(length.lt(least), flat, direction);
         let (back, wide) = (-origin * inverse, slack * inverse.abs());
-        (inverse, back - wide, back + wide)
+        let (least, most) = (L::splat(token, SOUND[0]), L::splat(token, SOUND[1]));
+        let sound = least.lt(slack) & least.lt(inverse.abs()) & least.lt(wide) & wide.lt(most);
+        let infinity = L::splat(token, f32::INFINITY);
+        (
+            L::select(sound, inverse, L::splat(token, 0.0)),
+            L::select(sound, back - wide, -infinity),
+            L::select(sound, back + wide, infinity),
+        )
     }
 
     /// Which rays may meet a box up to `t_max`, and from which `t` on.
