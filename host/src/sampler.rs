@@ -48,13 +48,22 @@ impl Sampler {
         match pattern {
             Pattern::Random => points.extend((0..count).map(|_| [self.uniform(), self.uniform()])),
             Pattern::Lattice => {
-                let generator = lattice_generator(count as u32);
+                let generator = u64::from(lattice_generator(count as u32));
                 let shift = [self.word(), self.word()];
-                points.extend((0..count as u32).map(|i| {
-                    let along = (u64::from(i) << 32) / count as u64;
-                    let across =
-                        (u64::from(i) * u64::from(generator) % count as u64 * (1 << 32)) / count as u64;
-                    [unit(shift[0].wrapping_add(along as u32)), unit(shift[1].wrapping_add(across as u32))]
+                // i / n as a fraction of 2^32, without a division for each.
+                let step = u64::MAX / count.max(1) as u64;
+                let fraction = |i: u64| (i * (step >> 16) >> 16) as u32;
+                let mut across = 0;
+                points.extend((0..count as u64).map(|i| {
+                    let point = [
+                        unit(shift[0].wrapping_add(fraction(i))),
+                        unit(shift[1].wrapping_add(fraction(across))),
+                    ];
+                    across += generator;
+                    if across >= count as u64 {
+                        across -= count as u64;
+                    }
+                    point
                 }));
             }
             Pattern::Sobol => {
