@@ -2,10 +2,13 @@
 
 mod camera;
 
-pub use camera::Camera;
+pub use camera::{Camera, CameraRequest, Frame, MAX_PIXELS, MAX_SIDE};
 
 use glam::Vec3;
 use std::ops::Range;
+
+/// The largest magnitude of a coordinate: squares of it still fit an `f32`.
+pub const MAX_COORDINATE: f32 = 1e18;
 
 /// What a surface does with light. Both sides reflect; only the front emits.
 #[derive(Clone, Debug, PartialEq)]
