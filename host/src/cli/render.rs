@@ -210,6 +210,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         scene: &scene,
         bvh: accel.bvh(),
         lights: &lights,
+        eye: camera.eye,
         camera: &frame,
         shadow_rays: args.shadow_rays,
         pattern: args.pattern,

@@ -10,7 +10,7 @@ pub use exact::Exact;
 use crate::film::{Tile, TileFilm};
 use crate::light::AreaLight;
 use crate::sampler::{Pattern, Sampler};
-use crate::scene::{CameraFrame, Scene};
+use crate::scene::{Frame, Scene};
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
 use occlude_kernel::{Bvh, Counter, Counts, RayPacket, Simd, Uncounted, offset};
@@ -27,8 +27,10 @@ pub struct Stage<'a> {
     pub bvh: Bvh<'a>,
     /// The lights.
     pub lights: &'a [AreaLight],
-    /// Where rays start and where they go.
-    pub camera: &'a CameraFrame,
+    /// Where camera rays start.
+    pub eye: Vec3,
+    /// Where they go.
+    pub camera: &'a Frame,
     /// Shadow rays a camera sample, over all lights together.
     pub shadow_rays: u32,
     /// How they are spread over a light.
@@ -206,7 +208,7 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scra
             let (x, y) = tile.position(first + lane);
             let mut sampler = Sampler::new(stage.seed, u64::from(y) * u64::from(width) + u64::from(x), pass);
             let (px, py) = (x as f32 + sampler.uniform(), y as f32 + sampler.uniform());
-            rays.set(lane, &occlude_kernel::Ray::from(stage.camera.eye, stage.camera.direction(px, py)));
+            rays.set(lane, &occlude_kernel::Ray::from(stage.eye, stage.camera.ray_direction(px, py)));
             scratch.samplers.push(sampler);
         }
         let (bvh, rays, active) = (stage.bvh, &rays, (1u32 << count) - 1);

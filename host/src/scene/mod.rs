@@ -1,11 +1,23 @@
 //! Scenes as their files describe them: triangles, materials, a camera.
 
 mod camera;
+mod lines;
+mod mtl;
+mod obj;
+mod polygon;
 
-pub use camera::{Camera, CameraFrame, CameraRequest};
+pub use camera::{Camera, CameraRequest, Frame, MAX_PIXELS, MAX_SIDE};
+
+use std::fs::File;
+use std::ops::Range;
+use std::path::{Path, PathBuf};
 
 use glam::Vec3;
-use std::ops::Range;
+
+use crate::error::{Error, Result};
+
+/// The largest magnitude of a coordinate: squares of it still fit an `f32`.
+pub const MAX_COORDINATE: f32 = 1e18;
 
 /// What a surface does with light. Both sides reflect; only the front emits.
 #[derive(Clone, Debug, PartialEq)]
@@ -69,30 +81,154 @@ impl Scene {
         let first = used.next()?;
         Some(used.fold((first, first), |(lo, hi), p| (lo.min(p), hi.max(p))))
     }
+
+    /// Whether any triangle emits.
+    pub fn has_light(&self) -> bool {
+        let emits: Vec<bool> = self.materials.iter().map(|m| m.emission.max_element() > 0.0).collect();
+        self.triangle_materials.iter().any(|&m| emits[m as usize])
+    }
 }
 
-/// TEMP
-pub fn load(path: &std::path::Path, _r: &CameraRequest) -> crate::Result<Scene> {
-    let file = if path.is_dir() { path.join("scene.obj") } else { path.to_owned() };
-    let (models, mats) =
-        tobj::load_obj(&file, &tobj::LoadOptions { triangulate: true, ..Default::default() })
-            .map_err(|e| crate::Error::input(&file, e.to_string()))?;
-    let mats = mats.map_err(|e| crate::Error::input(&file, e.to_string()))?;
-    let mut s =
-        Scene { name: path.file_stem().unwrap().to_string_lossy().into_owned(), ..Default::default() };
-    for m in mats {
-        let p = |v: Option<[f32; 3]>| v.map(Vec3::from).unwrap_or_default();
-        s.materials.push(Material { name: m.name.clone(), diffuse: p(m.diffuse), emission: p(m.emissive) });
+/// Reads a scene and finds its camera.
+///
+/// `path` is an `.obj` file, or a folder with a `scene.obj` or with no other `.obj` than one. The
+/// scene is named after it. The camera is that of the request's file, else of the `camera.json`
+/// beside the OBJ, else one that sees all of the scene; the request may replace single keys.
+///
+/// What an OBJ may hold, beyond the ordinary:
+///
+/// - Polygons are split along the diagonals from their first vertex where that is right, and by
+///   cutting ears where it is not; the triangles turn the way the polygon does. Where neither will
+///   do, as the polygon crosses itself or has a dent and over 50 000 vertices, there is a warning.
+/// - Triangles that are exactly without area are left out, with a warning.
+/// - Faces before any `usemtl` are grey (`Kd 0.5`), with a warning. A material without `Kd` is grey
+///   too, or black if it emits. Of materials of one name the last definition counts, with a warning;
+///   `Kd` above 1 is used as it is, with a warning.
+/// - Textures, normals, vertex colours, curves, points and lines are ignored.
+/// - Names are bytes: any encoding will do, and blanks may be part of them.
+///
+/// Errors name the file and, where one is at fault, the line. A vertex that is not finite or is
+/// beyond 1e18, a face that names a vertex not defined above it, an unknown material, a missing
+/// material file, a scene where nothing with an area emits: all are errors.
+///
+/// The OBJ is read as a stream. Of a closed mesh, a triangle costs about 45 bytes while loading, and
+/// 22 of them stay.
+pub fn load(path: &Path, camera: &CameraRequest) -> Result<Scene> {
+    let file = scene_file(path)?;
+    // Asked before opening: a pipe would wait for a writer.
+    if !std::fs::metadata(&file).map_err(Error::io("reading", &file))?.is_file() {
+        return Err(Error::input(&file, "this is not a file, and an OBJ file is wanted"));
     }
-    for m in models {
-        let base = s.positions.len() as u32;
-        s.positions.extend(m.mesh.positions.chunks(3).map(|c| Vec3::new(c[0], c[1], c[2])));
-        for t in m.mesh.indices.chunks(3) {
-            s.triangles.push([t[0] + base, t[1] + base, t[2] + base]);
-            s.triangle_materials.push(m.mesh.material_id.unwrap() as u32);
-        }
+    let open = File::open(&file).map_err(Error::io("reading", &file))?;
+    let draft = camera.read(file.parent().unwrap_or(Path::new("")))?;
+    let mut scene = match file.extension() {
+        Some(extension) if extension.eq_ignore_ascii_case("obj") => obj::load(&file, open)?,
+        _ => return Err(Error::input(&file, "scenes are read from .obj files; give one, or its folder")),
+    };
+    scene.name = name_of(path);
+    if let Some(bounds) = scene.bounds() {
+        scene.camera = Some(draft.complete(bounds, &mut scene.warnings)?);
     }
-    let cam = std::fs::read(file.with_file_name("camera.json")).unwrap();
-    s.camera = Some(serde_json::from_slice(&cam).unwrap());
-    Ok(s)
+    Ok(scene)
+}
+
+fn is_obj(path: &Path) -> bool {
+    path.extension().is_some_and(|e| e.eq_ignore_ascii_case("obj"))
+}
+
+/// The file to read for a path that may be a folder.
+fn scene_file(path: &Path) -> Result<PathBuf> {
+    if !std::fs::metadata(path).map_err(Error::io("reading the scene", path))?.is_dir() {
+        return Ok(path.to_owned());
+    }
+    if is_obj(path) {
+        return Err(Error::input(path, "this is a folder, and an OBJ file is wanted"));
+    }
+    let usual = path.join("scene.obj");
+    if usual.exists() {
+        return Ok(usual);
+    }
+    let reading = || Error::io("reading the folder", path);
+    let mut found = Vec::new();
+    for entry in std::fs::read_dir(path).map_err(reading())? {
+        found.push(PathBuf::from(entry.map_err(reading())?.file_name()));
+    }
+    found.sort();
+    let mut objs = found.iter().filter(|name| is_obj(name));
+    if let (Some(only), None) = (objs.next(), objs.next()) {
+        return Ok(path.join(only));
+    }
+    let mut list: Vec<String> = found.iter().take(12).map(|name| name.display().to_string()).collect();
+    if list.is_empty() {
+        list.push("nothing".to_owned());
+    } else if found.len() > list.len() {
+        list.push("...".to_owned());
+    }
+    let what =
+        format!("there is no scene.obj in this folder, nor just one .obj; it holds {}", list.join(", "));
+    Err(Error::input(path, what))
+}
+
+/// The folder's name, or the file's without `.obj`.
+fn name_of(path: &Path) -> String {
+    let whole = std::fs::canonicalize(path).unwrap_or_else(|_| path.to_owned());
+    let name = if is_obj(path) { path.file_stem() } else { path.file_name().or(whole.file_name()) };
+    name.map_or_else(|| "scene".to_owned(), |n| n.to_string_lossy().into_owned())
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const OBJ: &str = "mtllib a.mtl\nusemtl lamp\nv 0 0 0\nv 1 0 0\nv 0 2 0\nf 1 2 3\n";
+
+    fn folder(files: &[&str]) -> tempfile::TempDir {
+        let folder = tempfile::tempdir().unwrap();
+        std::fs::write(folder.path().join("a.mtl"), "newmtl lamp\nKe 1\n").unwrap();
+        files.iter().for_each(|name| std::fs::write(folder.path().join(name), OBJ).unwrap());
+        folder
+    }
+
+    fn message(path: &Path) -> String {
+        load(path, &CameraRequest::default()).unwrap_err().to_string()
+    }
+
+    #[test]
+    fn a_folder_or_a_file() {
+        let both = folder(&["scene.obj", "other.OBJ"]);
+        let scene = load(both.path(), &CameraRequest::default()).unwrap();
+        assert_eq!(scene.name, both.path().file_name().unwrap().to_str().unwrap());
+        assert_eq!(scene.bounds(), Some((Vec3::ZERO, Vec3::new(1.0, 2.0, 0.0))));
+        scene.camera.unwrap().check().unwrap();
+        let scene = load(&both.path().join("other.OBJ"), &CameraRequest::default()).unwrap();
+        assert_eq!(scene.name, "other");
+        load(folder(&["only.obj"]).path(), &CameraRequest::default()).unwrap();
+    }
+
+    #[test]
+    fn nothing_to_load() {
+        let two = folder(&["a.obj", "b.obj"]);
+        let said = message(two.path());
+        assert!(said.contains("no scene.obj") && said.contains("a.mtl, a.obj, b.obj"), "{said}");
+        assert!(message(&two.path().join("c.obj")).contains("c.obj"));
+        assert!(message(&two.path().join("a.mtl")).contains(".obj files"));
+        std::fs::create_dir(two.path().join("scene.obj")).unwrap();
+        assert!(message(two.path()).contains("scene.obj: this is not a file"));
+        assert!(message(&two.path().join("scene.obj")).contains("this is a folder"));
+    }
+
+    #[test]
+    fn a_camera_file_of_any_name() {
+        let folder = folder(&["scene.obj"]);
+        let file = folder.path().join("from above.json");
+        std::fs::write(&file, r#"{"eye": [0, 9, 0], "target": [0, 0, 0], "up": [0, 0, 1]}"#).unwrap();
+        let mut request = CameraRequest { file: Some(file), size: Some((8, 4)), ..Default::default() };
+        let said = load(folder.path(), &request).unwrap_err().to_string();
+        assert!(said.contains("from above.json: the key `vfov_deg` is missing"), "{said}");
+        request.vfov_deg = Some(30.0);
+        let camera = load(folder.path(), &request).unwrap().camera.unwrap();
+        assert_eq!((camera.eye, camera.vfov_deg, camera.width), (Vec3::Y * 9.0, 30.0, 8));
+        request.file = Some(folder.path().join("none.json"));
+        assert!(load(folder.path(), &request).unwrap_err().to_string().contains("none.json"));
+    }
 }
