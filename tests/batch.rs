@@ -18,7 +18,7 @@ fn dbg() {
         let lights = lights(&scene);
         let camera = scene.camera.unwrap();
         let frame = camera.frame();
-        let stage = Stage { scene: &scene, bvh: accel.bvh(), lights: &lights, camera: &frame, shadow_rays: 64, pattern: Default::default(), seed: 0, level: detect(), count: false };
+        let stage = Stage { scene: &scene, bvh: accel.bvh(), lights: &lights, eye: camera.eye, camera: &frame, shadow_rays: 64, pattern: Default::default(), seed: 0, level: detect(), count: false };
         let mut bad = 0;
         let mut all = 0;
         for pass in 0..2 { for tile in Tile::cover(camera.width, camera.height, 16) {

@@ -7,6 +7,7 @@
 
 use crate::scene::Scene;
 use glam::Vec3;
+use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
 use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
@@ -69,10 +70,18 @@ impl Accel {
         if triangles.is_empty() {
             return Self::default();
         }
-        let binary = build_binary(triangles, quality);
+        let boxes: Vec<Aabb> = triangles
+            .iter()
+            .map(|[a, b, c]| Aabb::new(a.min(*b).min(*c).into(), a.max(*b).max(*c).into()))
+            .collect();
+        let groups = Groups::of(&boxes);
+        let Some(binary) = build_binary(&groups.boxes, quality) else {
+            return Self::evenly(triangles, &boxes);
+        };
         let mut cutter = Cutter {
-            plan: plan(&binary),
+            plan: plan(&binary, &groups),
             binary: &binary,
+            groups: &groups,
             triangles,
             nodes: Vec::with_capacity(triangles.len() / 20 + 1),
             blocks: Vec::with_capacity(triangles.len() / 4 + 1),
@@ -80,6 +89,28 @@ impl Accel {
         cutter.root();
         let (nodes, blocks) = (cutter.nodes, cutter.blocks);
         Self { nodes, blocks, triangles: triangles.len() }
+    }
+
+    /// Cuts triangles evenly along a space-filling curve, where boxes overlap so much that no tree is good.
+    fn evenly(triangles: &[[Vec3; 3]], boxes: &[Aabb]) -> Self {
+        let whole = boxes.iter().fold(Aabb::empty(), |whole, b| whole.union(b));
+        let scale = 1.0 / whole.diagonal().as_dvec3().max(glam::DVec3::splat(f64::MIN_POSITIVE));
+        let mut order: Vec<(u64, u32)> = boxes
+            .iter()
+            .zip(0..)
+            .map(|(b, i)| {
+                let at = (b.center().as_dvec3() - whole.min.as_dvec3()) * scale;
+                (obvhs::ploc::morton::morton_encode_u64_unorm(at), i)
+            })
+            .collect();
+        order.sort_unstable();
+        let order: Vec<u32> = order.into_iter().map(|(_, i)| i).collect();
+        let (binary, groups) = (Bvh2::default(), Groups::default());
+        let mut cutter =
+            Cutter { plan: Vec::new(), binary: &binary, groups: &groups, triangles, nodes: Vec::new(), blocks: Vec::new() };
+        let parts: Vec<&[u32]> = order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
+        cutter.place(1, parts.len(), |cutter, part| cutter.even(parts[part], 2));
+        Self { nodes: cutter.nodes, blocks: cutter.blocks, triangles: triangles.len() }
     }
 
     /// The tree, to ask. Checks it, so ask for it once a render and not once a ray.
@@ -150,11 +181,65 @@ fn half_area(lower: Vec3, upper: Vec3) -> f32 {
     d.x * d.y + d.y * d.z + d.z * d.x
 }
 
-fn build_binary(triangles: &[[Vec3; 3]], quality: Quality) -> Bvh2 {
-    let boxes: Vec<obvhs::aabb::Aabb> = triangles
-        .iter()
-        .map(|[a, b, c]| obvhs::aabb::Aabb::new(a.min(*b).min(*c).into(), a.max(*b).max(*c).into()))
-        .collect();
+/// Triangles of the very same box, which no tree can part, stand in it as one.
+#[derive(Default)]
+struct Groups {
+    boxes: Vec<Aabb>,
+    /// Triangles of group `i`: from `first[i]` to `first[i + 1]` of `members`. Empty if each group is a triangle.
+    first: Vec<u32>,
+    members: Vec<u32>,
+}
+
+impl Groups {
+    fn of(boxes: &[Aabb]) -> Self {
+        // Few scenes have such triangles, and a glance at some tells.
+        let key = |b: &Aabb| [b.min.to_array(), b.max.to_array()].map(|corner| corner.map(f32::to_bits));
+        let step = boxes.len().div_ceil(1024).max(1);
+        let sample: Vec<_> = boxes.iter().step_by(step).map(key).collect();
+        let distinct: std::collections::HashSet<_> = sample.iter().collect();
+        if boxes.len() < 1024 || distinct.len() * 10 > sample.len() * 9 {
+            return Self { boxes: boxes.to_vec(), ..Self::default() };
+        }
+        let mut order: Vec<u32> = (0..boxes.len() as u32).collect();
+        order.sort_by_cached_key(|&i| key(&boxes[i as usize]));
+        let mut groups = Self::default();
+        for (place, &triangle) in order.iter().enumerate() {
+            let this = &boxes[triangle as usize];
+            if place == 0 || key(this) != key(&boxes[order[place - 1] as usize]) {
+                groups.boxes.push(*this);
+                groups.first.push(place as u32);
+            }
+        }
+        groups.first.push(boxes.len() as u32);
+        groups.members = order;
+        groups
+    }
+
+    fn len(&self, group: u32) -> u32 {
+        if self.first.is_empty() { 1 } else { self.first[group as usize + 1] - self.first[group as usize] }
+    }
+
+    fn extend(&self, triangles: &mut Vec<u32>, group: u32) {
+        if self.first.is_empty() {
+            triangles.push(group);
+        } else {
+            let members = self.first[group as usize] as usize..self.first[group as usize + 1] as usize;
+            triangles.extend_from_slice(&self.members[members]);
+        }
+    }
+}
+
+/// Where boxes take up this part of the whole on average, and there are this many, obvhs' merging takes a round
+/// for each of them, and the tree is no better than an even cut.
+const CROWDED: (f64, usize) = (0.003, 10_000);
+
+fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
+    let whole = boxes.iter().fold(Aabb::empty(), |whole, b| whole.union(b));
+    let areas: f64 = boxes.iter().map(|b| f64::from(b.half_area())).sum();
+    let crowding = areas / f64::from(whole.half_area()) / boxes.len() as f64;
+    if boxes.len() > CROWDED.1 && crowding > CROWDED.0 {
+        return None;
+    }
     let (distance, depth, reinsertion) = match quality {
         Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
         Quality::Medium => (PlocSearchDistance::Medium, 3, 0.05),
@@ -162,10 +247,10 @@ fn build_binary(triangles: &[[Vec3; 3]], quality: Quality) -> Bvh2 {
     };
     let indices = (0..boxes.len() as u32).collect();
     let mut binary =
-        PlocBuilder::with_capacity(boxes.len()).build(distance, &boxes, indices, SortPrecision::U64, depth);
+        PlocBuilder::with_capacity(boxes.len()).build(distance, boxes, indices, SortPrecision::U64, depth);
     ReinsertionOptimizer::default().run(&mut binary, reinsertion, None);
     binary.reorder_in_stack_traversal_order();
-    binary
+    Some(binary)
 }
 
 /// The cheapest way to stand for a subtree by at most `i + 1` children of a node, for `i` from 0 to 6.
@@ -178,7 +263,7 @@ struct Plan {
     own: u8,
 }
 
-fn plan(binary: &Bvh2) -> Vec<Plan> {
+fn plan(binary: &Bvh2, groups: &Groups) -> Vec<Plan> {
     let nodes = &binary.nodes;
     let mut plans = vec![Plan { cost: [0.0; 7], left: [0; 7], own: 0 }; nodes.len()];
     let mut counts = vec![0u32; nodes.len()];
@@ -187,7 +272,7 @@ fn plan(binary: &Bvh2) -> Vec<Plan> {
         let area = half_area(node.aabb().min.into(), node.aabb().max.into());
         let block = area * BLOCK_COST;
         if node.is_leaf() {
-            counts[index] = node.prim_count;
+            counts[index] = groups.len(binary.primitive_indices[node.first_index as usize]);
             plans[index].cost = [block; 7];
             continue;
         }
@@ -224,6 +309,7 @@ fn plan(binary: &Bvh2) -> Vec<Plan> {
 struct Cutter<'a> {
     plan: Vec<Plan>,
     binary: &'a Bvh2,
+    groups: &'a Groups,
     triangles: &'a [[Vec3; 3]],
     nodes: Vec<Node>,
     blocks: Vec<TriangleBlock>,
@@ -233,7 +319,7 @@ impl Cutter<'_> {
     fn root(&mut self) {
         // A root that is a block still needs a node above it.
         if self.binary.nodes[0].is_leaf() || self.plan[0].own == 0 {
-            let (child, lower, upper) = self.block(&self.below(0));
+            let (child, lower, upper) = self.even(&self.below(0), 2);
             let mut node = Node::EMPTY;
             node.set(0, lower.to_array(), upper.to_array(), child);
             self.nodes.push(node);
@@ -252,7 +338,7 @@ impl Cutter<'_> {
         self.place(level, parts.len(), |cutter, part| {
             let subtree = parts[part];
             if cutter.binary.nodes[subtree].is_leaf() || cutter.plan[subtree].own == 0 {
-                return cutter.block(&cutter.below(subtree));
+                return cutter.even(&cutter.below(subtree), level + 1);
             }
             // A tree that is too lopsided for the kernel's stack is cut evenly from here on.
             if level + 1 >= MAX_DEPTH - LEVELS_OF_ANY {
@@ -307,9 +393,9 @@ impl Cutter<'_> {
             let node = &self.binary.nodes[index];
             if node.is_leaf() {
                 let first = node.first_index as usize;
-                triangles.extend_from_slice(
-                    &self.binary.primitive_indices[first..first + node.prim_count as usize],
-                );
+                for &group in &self.binary.primitive_indices[first..first + node.prim_count as usize] {
+                    self.groups.extend(&mut triangles, group);
+                }
             } else {
                 stack.push(node.first_index as usize + 1);
                 stack.push(node.first_index as usize);
