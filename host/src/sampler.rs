@@ -31,6 +31,17 @@ impl Sampler {
         Self(Xoshiro128PlusPlus::seed_from_u64(mix(mixed)))
     }
 
+    /// Where in its pixel a camera sample lies: passes together form a scrambled (0, 2)-sequence over the square.
+    ///
+    /// Each alone is uniform. Their spread makes the mean of a pixel at an edge converge faster than the variance
+    /// between passes, from which its error is estimated, would let one expect.
+    #[inline]
+    pub fn in_pixel(seed: u64, pixel: u64, pass: u32) -> [f32; 2] {
+        let scramble = mix(mix(seed ^ 0x6a09_e667_f3bc_c909).wrapping_add(pixel));
+        let [x, y] = sobol(pass);
+        [unit(owen(x, scramble as u32)), unit(owen(y, (scramble >> 32) as u32))]
+    }
+
     /// Uniform in [0, 1), a multiple of 2⁻²⁴.
     #[inline]
     pub fn uniform(&mut self) -> f32 {

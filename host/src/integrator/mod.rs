@@ -206,10 +206,11 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scra
         let count = RayPacket::WIDTH.min(tile.len() - first);
         for lane in 0..count {
             let (x, y) = tile.position(first + lane);
-            let mut sampler = Sampler::new(stage.seed, u64::from(y) * u64::from(width) + u64::from(x), pass);
-            let (px, py) = (x as f32 + sampler.uniform(), y as f32 + sampler.uniform());
+            let pixel = u64::from(y) * u64::from(width) + u64::from(x);
+            let at = Sampler::in_pixel(stage.seed, pixel, pass);
+            let (px, py) = (x as f32 + at[0], y as f32 + at[1]);
             rays.set(lane, &occlude_kernel::Ray::from(stage.eye, stage.camera.ray_direction(px, py)));
-            scratch.samplers.push(sampler);
+            scratch.samplers.push(Sampler::new(stage.seed, pixel, pass));
         }
         let (bvh, rays, active) = (stage.bvh, &rays, (1u32 << count) - 1);
         let hits = if stage.count {
