@@ -5,7 +5,7 @@ use glam::Vec3;
 /// A half-open stretch of a line: the points `origin + t * direction` with `t_min < t <= t_max`.
 ///
 /// The direction need not be of unit length; `t` counts in its units. A direction of zero, or anything that is
-/// NaN or infinite (`t_max` may be infinite), makes a ray that hits nothing.
+/// NaN or infinite, makes a ray that hits nothing; only `t_min` may be minus infinity, and `t_max` infinity.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
     /// Where `t` is 0.

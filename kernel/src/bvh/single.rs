@@ -231,6 +231,10 @@ impl<S: Simd> Bvh<'_, S> {
                     let place = met.trailing_zeros() as usize & 7;
                     met &= met - 1;
                     let (child, at) = (node.children[place], entry[place]);
+                    // Its box is empty, or was never looked at: nothing promises that no ray meets it.
+                    if child == Child::NONE {
+                        continue;
+                    }
                     // Depth is checked at construction, so there is room; `get_mut` keeps a panic out of the loop.
                     if V::ORDERED {
                         // Farthest first, so that the nearest is on top.

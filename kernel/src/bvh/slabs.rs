@@ -14,6 +14,10 @@ pub(super) const SHORTEST: f32 = 1e-27;
 /// by less than the slack.
 const FLATTEST: f32 = 1e-9;
 
+/// Where slack, inverse and their product must lie. Beyond, a plane's product could overflow (planes and origin
+/// are within `2^20` slacks of 0) or lose digits to underflow, and the axis culls nothing.
+const SOUND: [f32; 2] = [f32::MIN_POSITIVE, 1e31];
+
 /// One ray in every lane, for the boxes of a node's children.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Slabs<L> {
@@ -37,9 +41,19 @@ impl<L: Lanes> Slabs<L> {
     pub(super) fn new(token: L::Token, ray: &crate::Ray, slack: f32) -> Self {
         let longest = ray.direction.abs().max_element();
         let inverse = ray.direction.to_array().map(|component| inverse(component, longest));
+        let sound = inverse.map(|inverse| {
+            let (inverse, [least, most]) = (inverse.abs(), SOUND);
+            slack > least && inverse > least && slack * inverse > least && slack * inverse < most
+        });
         let splat = |value| L::splat(token, value);
-        let shift =
-            |axis: usize, slack: f32| splat(slack * inverse[axis].abs() - ray.origin[axis] * inverse[axis]);
+        let shift = |axis: usize, slack: f32| {
+            splat(if sound[axis] {
+                slack * inverse[axis].abs() - ray.origin[axis] * inverse[axis]
+            } else {
+                f32::INFINITY.copysign(slack)
+            })
+        };
+        let inverse: [f32; 3] = core::array::from_fn(|axis| if sound[axis] { inverse[axis] } else { 0.0 });
         Self {
             inverse: inverse.map(splat),
             near: [shift(0, -slack), shift(1, -slack), shift(2, -slack)],
@@ -91,11 +105,21 @@ impl<L: Lanes> PacketSlabs<L> {
             let flat = L::select(direction[axis].lt(zero), -least, least);
             one / L::select(length[axis].lt(least), flat, direction[axis])
         });
-        let shift = |axis: usize, slack: L| slack * inverse[axis].abs() - origin[axis] * inverse[axis];
+        let [least, most] = SOUND.map(|bound| L::splat(token, bound));
+        let sound = inverse.map(|inverse| {
+            let (inverse, moved) = (inverse.abs(), slack * inverse.abs());
+            least.lt(slack) & least.lt(inverse) & least.lt(moved) & moved.lt(most)
+        });
+        let infinity = L::splat(token, f32::INFINITY);
+        let shift = |axis: usize, sign: L| {
+            let moved = sign * slack * inverse[axis].abs() - origin[axis] * inverse[axis];
+            L::select(sound[axis], moved, sign * infinity)
+        };
+        let slab = |sign: f32| core::array::from_fn(|axis| shift(axis, L::splat(token, sign)));
         Self {
-            inverse,
-            near: core::array::from_fn(|axis| shift(axis, -slack)),
-            far: core::array::from_fn(|axis| shift(axis, slack)),
+            inverse: core::array::from_fn(|axis| L::select(sound[axis], inverse[axis], zero)),
+            near: slab(-1.0),
+            far: slab(1.0),
             t_min,
         }
     }
