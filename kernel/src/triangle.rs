@@ -15,7 +15,9 @@
 //! no smaller than the set that holds the origin exactly. The two products must each be rounded: a fused
 //! multiply-add would break this, and nothing here uses one. (The original falls back to double precision when
 //! an edge function is zero; counting zero as inside makes that unnecessary.) A triangle seen exactly edge-on
-//! (`U = V = W = 0`) is missed; its neighbours share the edges and answer in its place.
+//! (`U = V = W = 0`) is missed; its neighbours share the edges and answer in its place. One seen edge-on but for
+//! rounding, in a line with the ray, can have three signs alike by chance, however far away it is: a hit must
+//! therefore also have the ray within the sheared vertices' box, which holds for every triangle that holds it.
 //!
 //! All of it is single operations in a fixed order, so every width gives the same answer bit for bit.
 
@@ -174,7 +176,17 @@ impl<L: Lanes> Sheared<L> {
         let front = zero.le(u) & zero.le(v) & zero.le(w) & first.lt(t) & t.le(last);
         let back = u.le(zero) & v.le(zero) & w.le(zero) & t.lt(first) & last.le(t);
         // With a determinant of zero t is zero too, and neither strict comparison holds.
-        Crossing { hit: front | back, det, t, u: v, v: w }
+        let mut hit = front | back;
+        if hit.any() {
+            // Of a triangle seen edge-on the signs are rounding: then the ray must at least meet its box.
+            let around = |axis: usize| {
+                let least = a[axis].min(b[axis]).min(c[axis]);
+                let most = a[axis].max(b[axis]).max(c[axis]);
+                least.le(zero) & zero.le(most)
+            };
+            hit = hit & around(0) & around(1);
+        }
+        Crossing { hit, det, t, u: v, v: w }
     }
 }
 
