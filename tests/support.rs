@@ -5,8 +5,8 @@ pub mod meshes;
 use glam::{DVec3, Vec3};
 use occlude_kernel::lanes::{self, Level, Task};
 use occlude_kernel::{
-    Bvh, Child, Counts, Hit, HitPacket, Native, Node, Ray, RayPacket, Scalar, Simd, Targets, TriangleBlock,
-    Uncounted,
+    BatchScratch, Bvh, Child, Counts, Hit, HitPacket, Native, Node, Ray, RayPacket, Scalar, Simd, Targets,
+    TriangleBlock, Uncounted,
 };
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
@@ -170,7 +170,7 @@ impl On<'_> {
     query!('q, each_hit_packet(rays: &'q RayPacket, active: u32, ignore: Option<u32>,
         counts: &'q mut Counts, visit: &'q mut dyn FnMut(usize, Hit) -> ControlFlow<()>) -> ());
     query!('q, occluded_batch(x: [f32; 3], targets: &'q Targets<'q>, ignore: Option<u32>,
-        counts: &'q mut Counts, blocked: &'q mut [u64]) -> ());
+        counts: &'q mut Counts, scratch: &'q mut BatchScratch, blocked: &'q mut [u64]) -> ());
 
     /// Every hit of a ray, nearest first.
     pub fn hits(&self, ray: &Ray, ignore: Option<u32>) -> Vec<Hit> {
@@ -200,7 +200,7 @@ impl On<'_> {
             hits[ray].push(hit);
             ControlFlow::Continue(())
         });
-        hits.iter_mut().for_each(sort);
+        hits.iter_mut().for_each(|hits| sort(hits));
         hits
     }
 }
@@ -210,7 +210,7 @@ pub fn families(bvh: Bvh<'_>) -> Vec<On<'_>> {
     Family::all().into_iter().map(|family| On { bvh, family }).collect()
 }
 
-fn sort(hits: &mut Vec<Hit>) {
+fn sort(hits: &mut [Hit]) {
     hits.sort_by(|a, b| a.t.total_cmp(&b.t).then(a.triangle.cmp(&b.triangle)));
 }
 

@@ -1,7 +1,7 @@
 //! Ray and triangle: the same bits at every width, and what mathematics says where it is clear.
 
 use glam::Vec3;
-use occlude_kernel::{Bvh, Counts, NO_TRIANGLE, Ray, RayPacket, Targets, TriangleBlock};
+use occlude_kernel::{BatchScratch, Bvh, Counts, NO_TRIANGLE, Ray, RayPacket, Targets, TriangleBlock};
 use occlude_tests::{
     Clear, Oracle, Random, Triangle, all_bits, bits, families, in_double, meshes, single_node,
 };
@@ -41,7 +41,14 @@ fn agree(triangles: &[Triangle], rays: &[Ray]) {
             let targets =
                 Targets::new(&end.as_ref()[0..1], &end.as_ref()[1..2], &end.as_ref()[2..3]).unwrap();
             let mut blocked = [0];
-            on.occluded_batch(ray.origin.into(), &targets, None, &mut Counts::default(), &mut blocked);
+            on.occluded_batch(
+                ray.origin.into(),
+                &targets,
+                None,
+                &mut Counts::default(),
+                &mut BatchScratch::new(),
+                &mut blocked,
+            );
             assert_eq!(
                 blocked[0] != 0,
                 !oracle.hits(&segment, None).is_empty(),

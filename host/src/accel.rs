@@ -74,14 +74,12 @@ impl Accel {
             .iter()
             .map(|[a, b, c]| Aabb::new(a.min(*b).min(*c).into(), a.max(*b).max(*c).into()))
             .collect();
-        let groups = Groups::of(&boxes);
-        let Some(binary) = build_binary(&groups.boxes, quality) else {
+        let Some(binary) = build_binary(&boxes, quality) else {
             return Self::evenly(triangles, &boxes);
         };
         let mut cutter = Cutter {
-            plan: plan(&binary, &groups),
+            plan: plan(&binary),
             binary: &binary,
-            groups: &groups,
             triangles,
             nodes: Vec::with_capacity(triangles.len() / 20 + 1),
             blocks: Vec::with_capacity(triangles.len() / 4 + 1),
@@ -105,10 +103,16 @@ impl Accel {
             .collect();
         order.sort_unstable();
         let order: Vec<u32> = order.into_iter().map(|(_, i)| i).collect();
-        let (binary, groups) = (Bvh2::default(), Groups::default());
-        let mut cutter =
-            Cutter { plan: Vec::new(), binary: &binary, groups: &groups, triangles, nodes: Vec::new(), blocks: Vec::new() };
-        let parts: Vec<&[u32]> = order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
+        let binary = Bvh2::default();
+        let mut cutter = Cutter {
+            plan: Vec::new(),
+            binary: &binary,
+            triangles,
+            nodes: Vec::new(),
+            blocks: Vec::new(),
+        };
+        let parts: Vec<&[u32]> =
+            order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
         cutter.place(1, parts.len(), |cutter, part| cutter.even(parts[part], 2));
         Self { nodes: cutter.nodes, blocks: cutter.blocks, triangles: triangles.len() }
     }
@@ -181,54 +185,6 @@ fn half_area(lower: Vec3, upper: Vec3) -> f32 {
     d.x * d.y + d.y * d.z + d.z * d.x
 }
 
-/// Triangles of the very same box, which no tree can part, stand in it as one.
-#[derive(Default)]
-struct Groups {
-    boxes: Vec<Aabb>,
-    /// Triangles of group `i`: from `first[i]` to `first[i + 1]` of `members`. Empty if each group is a triangle.
-    first: Vec<u32>,
-    members: Vec<u32>,
-}
-
-impl Groups {
-    fn of(boxes: &[Aabb]) -> Self {
-        // Few scenes have such triangles, and a glance at some tells.
-        let key = |b: &Aabb| [b.min.to_array(), b.max.to_array()].map(|corner| corner.map(f32::to_bits));
-        let step = boxes.len().div_ceil(1024).max(1);
-        let sample: Vec<_> = boxes.iter().step_by(step).map(key).collect();
-        let distinct: std::collections::HashSet<_> = sample.iter().collect();
-        if boxes.len() < 1024 || distinct.len() * 10 > sample.len() * 9 {
-            return Self { boxes: boxes.to_vec(), ..Self::default() };
-        }
-        let mut order: Vec<u32> = (0..boxes.len() as u32).collect();
-        order.sort_by_cached_key(|&i| key(&boxes[i as usize]));
-        let mut groups = Self::default();
-        for (place, &triangle) in order.iter().enumerate() {
-            let this = &boxes[triangle as usize];
-            if place == 0 || key(this) != key(&boxes[order[place - 1] as usize]) {
-                groups.boxes.push(*this);
-                groups.first.push(place as u32);
-            }
-        }
-        groups.first.push(boxes.len() as u32);
-        groups.members = order;
-        groups
-    }
-
-    fn len(&self, group: u32) -> u32 {
-        if self.first.is_empty() { 1 } else { self.first[group as usize + 1] - self.first[group as usize] }
-    }
-
-    fn extend(&self, triangles: &mut Vec<u32>, group: u32) {
-        if self.first.is_empty() {
-            triangles.push(group);
-        } else {
-            let members = self.first[group as usize] as usize..self.first[group as usize + 1] as usize;
-            triangles.extend_from_slice(&self.members[members]);
-        }
-    }
-}
-
 /// Where boxes take up this part of the whole on average, and there are this many, obvhs' merging takes a round
 /// for each of them, and the tree is no better than an even cut.
 const CROWDED: (f64, usize) = (0.003, 10_000);
@@ -240,6 +196,18 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
     if boxes.len() > CROWDED.1 && crowding > CROWDED.0 {
         return None;
     }
+    // PLOC merges boxes that are each other's best; where all are alike that is one pair a round, and building
+    // takes the square of their number. So each grows by a little of its own; the tree's boxes are not these.
+    let boxes: Vec<Aabb> = boxes
+        .iter()
+        .zip(1u32..)
+        .map(|(b, number)| {
+            let grain = b.diagonal().max_element() * 1e-3
+                + b.min.abs().max(b.max.abs()).max_element() * 1e-6;
+            let more = grain * (number.wrapping_mul(0x9e37_79b9) >> 8) as f32 / (1 << 24) as f32;
+            Aabb::new(b.min - more, b.max + more)
+        })
+        .collect();
     let (distance, depth, reinsertion) = match quality {
         Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
         Quality::Medium => (PlocSearchDistance::Medium, 3, 0.05),
@@ -247,7 +215,7 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
     };
     let indices = (0..boxes.len() as u32).collect();
     let mut binary =
-        PlocBuilder::with_capacity(boxes.len()).build(distance, boxes, indices, SortPrecision::U64, depth);
+        PlocBuilder::with_capacity(boxes.len()).build(distance, &boxes, indices, SortPrecision::U64, depth);
     ReinsertionOptimizer::default().run(&mut binary, reinsertion, None);
     binary.reorder_in_stack_traversal_order();
     Some(binary)
@@ -263,7 +231,7 @@ struct Plan {
     own: u8,
 }
 
-fn plan(binary: &Bvh2, groups: &Groups) -> Vec<Plan> {
+fn plan(binary: &Bvh2) -> Vec<Plan> {
     let nodes = &binary.nodes;
     let mut plans = vec![Plan { cost: [0.0; 7], left: [0; 7], own: 0 }; nodes.len()];
     let mut counts = vec![0u32; nodes.len()];
@@ -272,7 +240,7 @@ fn plan(binary: &Bvh2, groups: &Groups) -> Vec<Plan> {
         let area = half_area(node.aabb().min.into(), node.aabb().max.into());
         let block = area * BLOCK_COST;
         if node.is_leaf() {
-            counts[index] = groups.len(binary.primitive_indices[node.first_index as usize]);
+            counts[index] = node.prim_count;
             plans[index].cost = [block; 7];
             continue;
         }
@@ -309,7 +277,6 @@ fn plan(binary: &Bvh2, groups: &Groups) -> Vec<Plan> {
 struct Cutter<'a> {
     plan: Vec<Plan>,
     binary: &'a Bvh2,
-    groups: &'a Groups,
     triangles: &'a [[Vec3; 3]],
     nodes: Vec<Node>,
     blocks: Vec<TriangleBlock>,
@@ -319,10 +286,8 @@ impl Cutter<'_> {
     fn root(&mut self) {
         // A root that is a block still needs a node above it.
         if self.binary.nodes[0].is_leaf() || self.plan[0].own == 0 {
-            let (child, lower, upper) = self.even(&self.below(0), 2);
-            let mut node = Node::EMPTY;
-            node.set(0, lower.to_array(), upper.to_array(), child);
-            self.nodes.push(node);
+            let below = self.below(0);
+            self.place(1, 1, |cutter, _| cutter.even(&below, 2));
         } else {
             self.node(0, 1);
         }
@@ -393,9 +358,8 @@ impl Cutter<'_> {
             let node = &self.binary.nodes[index];
             if node.is_leaf() {
                 let first = node.first_index as usize;
-                for &group in &self.binary.primitive_indices[first..first + node.prim_count as usize] {
-                    self.groups.extend(&mut triangles, group);
-                }
+                triangles
+                    .extend_from_slice(&self.binary.primitive_indices[first..first + node.prim_count as usize]);
             } else {
                 stack.push(node.first_index as usize + 1);
                 stack.push(node.first_index as usize);

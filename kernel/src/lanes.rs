@@ -17,10 +17,10 @@ use core::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Sub};
 
 #[cfg(feature = "dispatch")]
 mod dispatched;
+#[cfg(all(feature = "dispatch", any(target_arch = "x86", target_arch = "x86_64")))]
+pub use dispatched::Dispatched16;
 #[cfg(feature = "dispatch")]
-pub use dispatched::{
-    Dispatched, Dispatched16, Level, Task, detect, dispatch, level_name, level_named, levels,
-};
+pub use dispatched::{Dispatched, Level, Task, detect, dispatch, level_name, level_named, levels};
 
 /// One bool for each lane.
 pub trait Mask: Copy + Debug + BitAnd<Output = Self> + BitOr<Output = Self> {

@@ -15,7 +15,9 @@
 //! no smaller than the set that holds the origin exactly. The two products must each be rounded: a fused
 //! multiply-add would break this, and nothing here uses one. (The original falls back to double precision when
 //! an edge function is zero; counting zero as inside makes that unnecessary.) A triangle seen exactly edge-on
-//! (`U = V = W = 0`) is missed; its neighbours share the edges and answer in its place.
+//! (`U = V = W = 0`) is missed; its neighbours share the edges and answer in its place. One seen edge-on but for
+//! rounding, in a line with the ray, can have three signs alike by chance, however far away it is: a hit must
+//! therefore also have the ray within the sheared vertices' box, which holds for every triangle that holds it.
 //!
 //! Where along the ray is another question, and asked only where a lane is inside: `t = n (a - o) / n d` with the
 //! normal n of the triangle's own edges, held between the t of the vertices.
@@ -179,6 +181,10 @@ impl<L: Lanes> Sheared<L> {
         if !inside.any() {
             return Crossing { hit: inside, det, t: zero, u: v, v: w };
         }
+        // Of a triangle seen edge-on the signs are rounding: then the ray must at least meet its box.
+        let x = a[0].min(b[0]).min(c[0]).le(zero) & zero.le(a[0].max(b[0]).max(c[0]));
+        let y = a[1].min(b[1]).min(c[1]).le(zero) & zero.le(a[1].max(b[1]).max(c[1]));
+        let inside = inside & x & y;
         // Where the line crosses the plane. The weights would give t too, but for long thin triangles they are
         // small differences of large products, and t is off by more than a point is moved off its surface.
         let n = vec3x::cross(vec3x::sub(triangle[1], triangle[0]), vec3x::sub(triangle[2], triangle[0]));

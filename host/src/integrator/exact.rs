@@ -1,8 +1,8 @@
 //! Every shadow ray traced: the answers are right, one by one.
 
 use super::{Questions, Stage, Visibility};
-use occlude_kernel::lanes::{Task, dispatch};
 use crate::light::AreaLight;
+use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::{BatchScratch, Bvh, Counter, Counts, Simd, Targets, Uncounted};
 
 /// Traces every shadow ray through the scene's tree, a batch at a time.
@@ -22,7 +22,10 @@ impl Visibility for Exact {
         if stage.count {
             dispatch(stage.level, Trace { bvh, lights: stage.lights, questions, estimates, counter: counts });
         } else {
-            dispatch(stage.level, Trace { bvh, lights: stage.lights, questions, estimates, counter: &mut Uncounted });
+            dispatch(
+                stage.level,
+                Trace { bvh, lights: stage.lights, questions, estimates, counter: &mut Uncounted },
+            );
         }
     }
 }

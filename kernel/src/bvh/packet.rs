@@ -70,7 +70,8 @@ impl<L: Lanes> PacketVisitor<L> for Closest<'_> {
             if self.best.hit >> ray & 1 == 0 || hit.nearer_than(&self.best.hits[ray]) {
                 self.best.hit |= 1 << ray;
                 self.best.hits[ray] = hit;
-                t_max[lane] = t_max[lane].min(hit.t);
+                // The test compares products, whose rounding must not hide a hit at the same quotient.
+                t_max[lane] = t_max[lane].min(hit.t + hit.t.abs() * (2.0 * f32::EPSILON));
             }
         }
         0

@@ -94,11 +94,7 @@ impl Plane {
         Self {
             normal,
             offset: at - normal.dot(x) + slack,
-            side: [
-                usize::from(normal.x > 0.0),
-                usize::from(normal.y > 0.0),
-                usize::from(normal.z > 0.0),
-            ],
+            side: [usize::from(normal.x > 0.0), usize::from(normal.y > 0.0), usize::from(normal.z > 0.0)],
         }
     }
 }
@@ -210,8 +206,7 @@ impl Pyramid {
             return false;
         }
         let position = 16.0 * ROUNDING * this.reach;
-        this.rounding =
-            Vec3::new(extent(rows[0]), extent(rows[1]), extent(rows[2])) * (CAUTION * position);
+        this.rounding = Vec3::new(extent(rows[0]), extent(rows[1]), extent(rows[2])) * (CAUTION * position);
         let slack = |row: Vec3, edge: f32| 4.0 * position * (extent(row) + edge.abs() * extent(rows[2]));
         let side = |row: Vec3, edge: f32, sign: f32| {
             Plane::new((row - rows[2] * edge) * sign, 0.0, x, slack(row, edge))
@@ -363,17 +358,21 @@ impl Pyramid {
             while axis < 2 {
                 let (centre, size) = if axis == 0 { (s, s_half) } else { (t, t_half) };
                 let (least, most) = (centre - size, centre + size);
-                let (least, scale) = (
-                    (least * by_near).min(least * by_far),
-                    (one(self.least[axis]), one(self.scale[axis])),
-                );
+                let (least, scale) =
+                    ((least * by_near).min(least * by_far), (one(self.least[axis]), one(self.scale[axis])));
                 let most = (most * by_near).max(most * by_far);
                 let (low, high) = ((least - scale.0) * scale.1, (most - scale.0) * scale.1);
                 let last = one(CELLS as f32 - 1.0);
                 // Rounding of the last steps, in cells.
                 let slip = one(1e-3);
-                N::<S>::select(ahead, low - slip, zero).max(zero).min(last).store(&mut ranges[2 * axis][from..]);
-                N::<S>::select(ahead, high + slip, last).max(zero).min(last).store(&mut ranges[2 * axis + 1][from..]);
+                N::<S>::select(ahead, low - slip, zero)
+                    .max(zero)
+                    .min(last)
+                    .store(&mut ranges[2 * axis][from..]);
+                N::<S>::select(ahead, high + slip, last)
+                    .max(zero)
+                    .min(last)
+                    .store(&mut ranges[2 * axis + 1][from..]);
                 axis += 1;
             }
             from += N::<S>::WIDTH;
@@ -390,7 +389,13 @@ impl Pyramid {
 
     /// The middle and the half width of a linear function over boxes, widened by its rounding.
     #[inline(always)]
-    fn span<S: Simd>(&self, simd: S, centre: [S::Node; 3], size: [S::Node; 3], k: usize) -> (S::Node, S::Node) {
+    fn span<S: Simd>(
+        &self,
+        simd: S,
+        centre: [S::Node; 3],
+        size: [S::Node; 3],
+        k: usize,
+    ) -> (S::Node, S::Node) {
         let [x, y, z] = vec3x::splat::<S::Node>(simd.token(), self.rows[k].abs().to_array());
         let half = size[0].mul_add(x, size[1].mul_add(y, size[2] * z));
         (self.row(simd, centre, k), half + S::Node::splat(simd.token(), self.rounding[k]))

@@ -1,7 +1,9 @@
 //! Vectors chosen at run time, by `fearless_simd`.
 
 use super::{Lanes, Mask, Simd};
-use fearless_simd::{Avx512, Select, SimdBase, SimdFloat, SimdMask, f32x8, f32x16, mask32x8, mask32x16};
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+use fearless_simd::Avx512;
+use fearless_simd::{Select, SimdBase, SimdFloat, SimdMask, f32x8, f32x16, mask32x8, mask32x16};
 
 pub use fearless_simd::Level;
 
@@ -10,6 +12,7 @@ pub use fearless_simd::Level;
 pub struct Dispatched<S>(S);
 
 /// Sixteen lanes a packet, where a register holds them.
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
 #[derive(Clone, Copy, Debug)]
 pub struct Dispatched16(Avx512);
 
@@ -24,6 +27,7 @@ impl<S: fearless_simd::Simd> Simd for Dispatched<S> {
     }
 }
 
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
 impl Simd for Dispatched16 {
     type Token = Avx512;
     type Node = f32x8<Avx512>;
