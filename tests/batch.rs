@@ -1,75 +1,118 @@
-//! The batch query against single rays, on real scenes.
+//! The batch query against single rays, on real scenes: the same answer for every sample.
 
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::film::Tile;
+use occlude_host::generate::{Kind, generate};
 use occlude_host::integrator::{Stage, questions};
 use occlude_host::light::lights;
-use occlude_host::scene::{CameraRequest, load};
-use occlude_kernel::lanes::detect;
-use occlude_kernel::{BatchScratch, Ray, Scalar, Targets, Uncounted};
+use occlude_host::sampler::Pattern;
+use occlude_host::scene::{CameraRequest, Scene, load};
+use occlude_kernel::lanes::{Task, detect, dispatch};
+use occlude_kernel::{BatchScratch, Bvh, Counts, Ray, Simd, Targets, Uncounted};
+use occlude_tests::shared_scene;
 use std::path::Path;
 
-#[test]
-fn dbg() {
-    let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/scenes");
-    for name in ["sponza_part"] {
-        let scene = load(&root.join(name), &CameraRequest::default()).unwrap();
-        let accel = Accel::build(&scene, Quality::Medium);
-        let lights = lights(&scene);
-        let camera = scene.camera.unwrap();
-        let frame = camera.frame();
-        let stage = Stage {
-            scene: &scene,
-            bvh: accel.bvh(),
-            lights: &lights,
-            eye: camera.eye,
-            camera: &frame,
-            shadow_rays: 64,
-            pattern: Default::default(),
-            seed: 0,
-            level: detect(),
-            count: false,
-        };
-        let mut bad = 0;
-        let mut all = 0;
-        for pass in 0..2 {
-            for tile in Tile::cover(camera.width, camera.height, 16) {
-                let q = questions(&stage, tile, camera.width, pass);
-                let [x, y, z] = &q.targets;
-                let mut scratch = BatchScratch::new();
-                for b in &q.batches {
-                    let l = &lights[b.light as usize];
-                    let p = &q.points[b.point as usize];
-                    let r = b.samples.start as usize..b.samples.end as usize;
-                    let t = Targets::new(&x[r.clone()], &y[r.clone()], &z[r.clone()])
-                        .unwrap()
-                        .on_parallelogram(l.corner, l.u, l.v);
-                    let mut m = [0u64; 1];
-                    stage.bvh.occluded_batch(p.origin, &t, None, &mut Uncounted, &mut scratch, &mut m);
-                    for i in 0..t.len() {
-                        all += 1;
-                        let ray = Ray::segment(p.origin, t.get(i));
-                        let a = stage.bvh.on(Scalar).occluder(&ray, None, &mut Uncounted);
-                        if a.is_some() != (m[0] >> i & 1 == 1) {
-                            bad += 1;
-                            let hit = a.and_then(|_| stage.bvh.closest(&ray, None, &mut Uncounted));
-                            eprintln!(
-                                "{name} light {} point {:?} n {:?} tri {} target {:?}: single {:?} hit {:?} verts {:?} batch {}",
-                                b.light,
-                                p.origin,
-                                p.normal,
-                                p.triangle,
-                                t.get(i),
-                                a,
-                                hit,
-                                a.map(|a| scene.vertices(a)),
-                                m[0] >> i & 1
-                            );
-                        }
-                    }
-                }
+/// What the batch says of all targets and what single rays say, in words of 64.
+struct Ask<'a> {
+    bvh: Bvh<'a>,
+    x: [f32; 3],
+    targets: Targets<'a>,
+    scratch: &'a mut BatchScratch,
+}
+
+impl Task for Ask<'_> {
+    type Output = (Vec<u64>, Vec<u64>);
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> Self::Output {
+        let (bvh, words) = (self.bvh.on(simd), self.targets.len().div_ceil(64));
+        let (mut batch, mut single) = (vec![0; words], vec![0; words]);
+        bvh.occluded_batch(self.x, &self.targets, None, &mut Counts::default(), self.scratch, &mut batch);
+        for i in 0..self.targets.len() {
+            let ray = Ray::segment(self.x, self.targets.get(i));
+            single[i / 64] |= u64::from(bvh.occluded(&ray, None, &mut Uncounted)) << (i % 64);
+        }
+        (batch, single)
+    }
+}
+
+/// Asks about every light from the points of some tiles, with and without the light's plane.
+fn agree(name: &str, scene: &Scene, shadow_rays: u32) {
+    let accel = Accel::build(scene, Quality::Medium);
+    let lights = lights(scene);
+    let camera = scene.camera.expect("a camera");
+    let frame = camera.frame();
+    let stage = Stage {
+        scene,
+        bvh: accel.bvh(),
+        lights: &lights,
+        eye: camera.eye,
+        camera: &frame,
+        shadow_rays,
+        pattern: Pattern::Jittered,
+        seed: u64::from(shadow_rays),
+        level: detect(),
+        count: false,
+    };
+    let mut scratch = BatchScratch::new();
+    let (mut asked, mut blocked) = (0, 0);
+    for (index, tile) in Tile::cover(camera.width, camera.height, 16).enumerate() {
+        if index % 37 != shadow_rays as usize % 37 {
+            continue;
+        }
+        let questions = questions(&stage, tile, camera.width, 0);
+        let [x, y, z] = &questions.targets;
+        for batch in &questions.batches {
+            let light = &lights[batch.light as usize];
+            let point = &questions.points[batch.point as usize];
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let any =
+                Targets::new(&x[samples.clone()], &y[samples.clone()], &z[samples]).expect("one length");
+            for targets in [any, any.on_parallelogram(light.corner, light.u, light.v)] {
+                let (bvh, x, scratch) = (stage.bvh, point.origin.into(), &mut scratch);
+                let (batch, single) = dispatch(detect(), Ask { bvh, x, targets, scratch });
+                assert_eq!(batch, single, "{name}: from {:?}, {} targets", point.origin, targets.len());
+                asked += targets.len();
+                blocked += single.iter().map(|word| word.count_ones()).sum::<u32>();
             }
         }
-        eprintln!("{name}: {bad} of {all}");
+    }
+    assert!(asked > 1000, "{name}: only {asked} rays");
+    println!("{name}: {asked} rays, {blocked} blocked, all agree");
+}
+
+const COUNTS: [u32; 4] = [3, 16, 64, 256];
+
+#[test]
+fn on_our_scenes() {
+    for name in ["cornell", "plates", "fence", "half_plane", "columns"] {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scenes").join(name);
+        let scene = load(&folder, &CameraRequest::default()).expect("it loads");
+        for count in COUNTS {
+            agree(name, &scene, count);
+        }
+    }
+}
+
+#[test]
+fn on_generated_scenes() {
+    for kind in Kind::ALL {
+        let scene = generate(kind, 1, 30_000);
+        for count in COUNTS {
+            agree(kind.name(), &scene, count);
+        }
+    }
+}
+
+#[test]
+fn on_shared_scenes() {
+    for name in
+        ["cornell_original", "bunny_penumbra", "sponza_part", "teapot_toys", "apple_tree", "vented_case"]
+    {
+        let Some(folder) = shared_scene(name) else { continue };
+        let scene = load(&folder, &CameraRequest::default()).expect("it loads");
+        for count in COUNTS {
+            agree(name, &scene, count);
+        }
     }
 }

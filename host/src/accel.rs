@@ -104,13 +104,8 @@ impl Accel {
         order.sort_unstable();
         let order: Vec<u32> = order.into_iter().map(|(_, i)| i).collect();
         let binary = Bvh2::default();
-        let mut cutter = Cutter {
-            plan: Vec::new(),
-            binary: &binary,
-            triangles,
-            nodes: Vec::new(),
-            blocks: Vec::new(),
-        };
+        let mut cutter =
+            Cutter { plan: Vec::new(), binary: &binary, triangles, nodes: Vec::new(), blocks: Vec::new() };
         let parts: Vec<&[u32]> =
             order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
         cutter.place(1, parts.len(), |cutter, part| cutter.even(parts[part], 2));
@@ -202,8 +197,7 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
         .iter()
         .zip(1u32..)
         .map(|(b, number)| {
-            let grain = b.diagonal().max_element() * 1e-3
-                + b.min.abs().max(b.max.abs()).max_element() * 1e-6;
+            let grain = b.diagonal().max_element() * 1e-3 + b.min.abs().max(b.max.abs()).max_element() * 1e-6;
             let more = grain * (number.wrapping_mul(0x9e37_79b9) >> 8) as f32 / (1 << 24) as f32;
             Aabb::new(b.min - more, b.max + more)
         })
@@ -358,8 +352,9 @@ impl Cutter<'_> {
             let node = &self.binary.nodes[index];
             if node.is_leaf() {
                 let first = node.first_index as usize;
-                triangles
-                    .extend_from_slice(&self.binary.primitive_indices[first..first + node.prim_count as usize]);
+                triangles.extend_from_slice(
+                    &self.binary.primitive_indices[first..first + node.prim_count as usize],
+                );
             } else {
                 stack.push(node.first_index as usize + 1);
                 stack.push(node.first_index as usize);
