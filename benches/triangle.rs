@@ -32,8 +32,9 @@ fn block(c: &mut Criterion) {
     let Ok(bvh) = Bvh::new(&nodes, &blocks) else { return };
     let rays: Vec<Ray> = (0..1024)
         .map(|i| {
-            let at =
-                |salt: u32| ((i * 2654435761u32 ^ salt).wrapping_mul(0x9e37_79b9) >> 8) as f32 / 16_777_216.0;
+            let at = |salt: u32| {
+                ((i.wrapping_mul(2_654_435_761) ^ salt).wrapping_mul(0x9e37_79b9) >> 8) as f32 / 16_777_216.0
+            };
             Ray::segment([0.0; 3], [at(1) * 8.0 - 4.0, at(2) * 2.0 - 1.0, 2.0])
         })
         .collect();

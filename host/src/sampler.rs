@@ -63,7 +63,7 @@ impl Sampler {
                 let shift = [self.word(), self.word()];
                 // i / n as a fraction of 2^32, without a division for each.
                 let step = u64::MAX / count.max(1) as u64;
-                let fraction = |i: u64| (i * (step >> 16) >> 16) as u32;
+                let fraction = |i: u64| ((i * (step >> 16)) >> 16) as u32;
                 let mut across = 0;
                 points.extend((0..count as u64).map(|i| {
                     let point = [

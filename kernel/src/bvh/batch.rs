@@ -152,15 +152,7 @@ impl<S: Simd> Bvh<'_, S> {
             let count = (targets.len() - from).min(MOST);
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
                 self.packets_blocked(x, targets, from, count, ignore, counter)
-            } else if Pyramid::new(
-                self.simd,
-                x.into(),
-                targets,
-                from,
-                count,
-                self.magnitude,
-                &mut scratch.pyramid,
-            ) {
+            } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
                 self.pyramid_blocked(&mut scratch.pyramid, ignore, counter)
             } else {
                 self.packets_blocked(x, targets, from, count, ignore, counter)

@@ -130,20 +130,20 @@ fn extent(v: Vec3) -> f32 {
 }
 
 impl Pyramid {
-    /// `None` where the targets do not lie in one pyramid: on both sides of x, at very different depths, or
-    /// where anything is not finite.
+    /// Aims at `count` targets from the `from`th on. False where they do not lie in one pyramid: on both sides of
+    /// x, at very different depths, or where anything is not finite.
     #[inline(always)]
-    pub(super) fn new<S: Simd>(
+    pub(super) fn aim<S: Simd>(
+        &mut self,
         simd: S,
         x: Vec3,
         targets: &Targets<'_>,
         from: usize,
         count: usize,
         magnitude: f32,
-        scratch: &mut Self,
     ) -> bool {
         let token = simd.token();
-        let this = scratch;
+        let this = self;
         this.x = x;
         this.count = count;
         for axis in 0..3 {
