@@ -31,7 +31,7 @@ fn block(c: &mut Criterion) {
     let (nodes, blocks) = ([root], [block]);
     let Ok(bvh) = Bvh::new(&nodes, &blocks) else { return };
     let rays: Vec<Ray> = (0..1024)
-        .map(|i| {
+        .map(|i: u32| {
             let at = |salt: u32| {
                 ((i.wrapping_mul(2_654_435_761) ^ salt).wrapping_mul(0x9e37_79b9) >> 8) as f32 / 16_777_216.0
             };

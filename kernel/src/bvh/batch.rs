@@ -2,7 +2,7 @@
 
 use super::Bvh;
 use super::packet::{Any, Rays};
-use super::pyramid::{MOST, Pyramid};
+use super::pyramid::{MOST, NO_STACK, Pyramid, Stack};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::vec3x;
@@ -104,15 +104,16 @@ impl<'a> Targets<'a> {
     }
 }
 
-/// What a batch works in: keep one a thread, so that nothing is cleared between queries. About four kilobytes.
+/// What a batch works in: keep one a thread, so that nothing is cleared between queries. About six kilobytes.
 pub struct BatchScratch {
     pyramid: Pyramid,
+    stack: Stack,
 }
 
 impl BatchScratch {
     /// Ready for any query.
     pub const fn new() -> Self {
-        Self { pyramid: Pyramid::EMPTY }
+        Self { pyramid: Pyramid::EMPTY, stack: NO_STACK }
     }
 }
 
@@ -153,7 +154,7 @@ impl<S: Simd> Bvh<'_, S> {
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
                 self.packets_blocked(x, targets, from, count, ignore, counter)
             } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
-                self.pyramid_blocked(&mut scratch.pyramid, ignore, counter)
+                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, ignore, counter)
             } else {
                 self.packets_blocked(x, targets, from, count, ignore, counter)
             };

@@ -44,6 +44,12 @@ const LEAF_LONE: u32 = 3;
 /// Bounds on rounding are this many units of the textbook's first-order bounds.
 const CAUTION: f32 = 2.0;
 
+/// Subtrees yet to visit: how deep each begins, and the targets it may hide.
+pub(super) type Stack = [(Child, f32, u64); STACK];
+
+/// A stack of anything.
+pub(super) const NO_STACK: Stack = [(Child::NONE, 0.0, 0); STACK];
+
 /// Up to 64 targets as seen from x.
 pub(super) struct Pyramid {
     x: Vec3,
@@ -729,6 +735,7 @@ impl<S: Simd> Bvh<'_, S> {
     pub(super) fn pyramid_blocked(
         &self,
         pyramid: &mut Pyramid,
+        stack: &mut Stack,
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
@@ -744,7 +751,6 @@ impl<S: Simd> Bvh<'_, S> {
             depth_bound: [0.0; 8],
         };
         let mut found = Found::NOTHING;
-        let mut stack = [(Child::NONE, 0.0f32, 0u64); STACK];
         let mut len = 0;
         let (mut visits, mut sorted) = (0, false);
         let (mut next, mut may) = (Child::node(0), every);

@@ -232,7 +232,9 @@ impl<S: Simd> Bvh<'_, S> {
         let slabs = Slabs::<S::Node>::new(token, ray, self.slack(ray.origin));
         let sheared = shear_one(self.simd, ray, axis);
 
-        let mut stack = [(Child::NONE, 0.0f32); STACK];
+        // Apart, so that each is cleared in one go and the distances not at all where order does not matter.
+        let mut stack = [Child::NONE; STACK];
+        let mut entries = [0.0f32; STACK];
         let mut len = 0;
         let mut next = subtree;
         let mut entry = [0.0; 8];
@@ -263,18 +265,17 @@ impl<S: Simd> Bvh<'_, S> {
                     if child == Child::NONE {
                         continue;
                     }
-                    // Depth is checked at construction, so there is room; `get_mut` keeps a panic out of the loop.
+                    let mut slot = len;
                     if V::ORDERED {
                         // Farthest first, so that the nearest is on top.
-                        let mut slot = len;
-                        while slot > first && stack[slot - 1].1 < at {
-                            stack[slot] = stack[slot - 1];
+                        while slot > first && entries[slot - 1] < at {
+                            (stack[slot], entries[slot]) = (stack[slot - 1], entries[slot - 1]);
                             slot -= 1;
                         }
-                        stack[slot] = (child, at);
-                    } else if let Some(slot) = stack.get_mut(len) {
-                        slot.0 = child;
+                        entries[slot] = at;
                     }
+                    // Depth is checked at construction, so there is always room.
+                    stack[slot] = child;
                     len += 1;
                 }
             }
@@ -283,11 +284,10 @@ impl<S: Simd> Bvh<'_, S> {
                     return;
                 }
                 len -= 1;
-                let (child, at) = stack[len];
-                if V::ORDERED && at > visitor.t_max() {
+                if V::ORDERED && entries[len] > visitor.t_max() {
                     continue;
                 }
-                next = child;
+                next = stack[len];
                 break;
             }
         }
