@@ -149,8 +149,8 @@ impl<L: Lanes> Sheared<L> {
         t_min: L,
         t_max: L,
     ) -> Self {
-        let z = direction[axes.z];
-        let shear = [direction[axes.x] / z, direction[axes.y] / z, L::splat(token, 1.0) / z];
+        let step = L::splat(token, 1.0) / direction[axes.z];
+        let shear = [direction[axes.x] * step, direction[axes.y] * step, step];
         Self { axes, origin, direction, shear, t_min, t_max }
     }
 
@@ -255,14 +255,14 @@ pub(crate) fn dominant_axis(origin: Vec3, direction: Vec3) -> Option<usize> {
 #[inline(always)]
 pub(crate) fn shear_one<S: Simd>(simd: S, ray: &crate::Ray, axis: usize) -> Sheared<S::Node> {
     let token = simd.token();
-    // Divided once as scalars: the same division as in any lane.
+    // Divided once as a scalar: the same division as in any lane.
     let axes = Axes::of(axis);
-    let z = ray.direction[axes.z];
+    let step = 1.0 / ray.direction[axes.z];
     Sheared {
         axes,
         origin: vec3x::splat(token, ray.origin.to_array()),
         direction: vec3x::splat(token, ray.direction.to_array()),
-        shear: vec3x::splat(token, [ray.direction[axes.x] / z, ray.direction[axes.y] / z, 1.0 / z]),
+        shear: vec3x::splat(token, [ray.direction[axes.x] * step, ray.direction[axes.y] * step, step]),
         t_min: S::Node::splat(token, ray.t_min),
         t_max: S::Node::splat(token, ray.t_max),
     }

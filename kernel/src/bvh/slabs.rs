@@ -7,6 +7,7 @@
 use super::Node;
 use crate::lanes::{Lanes, Mask};
 use crate::vec3x::{self, Vec3x};
+use glam::Vec3;
 
 /// Below this length a direction counts as zero.
 pub(super) const SHORTEST: f32 = 1e-27;
@@ -41,32 +42,36 @@ impl<L: Lanes> Slabs<L> {
     #[inline(always)]
     pub(super) fn new(token: L::Token, ray: &crate::Ray, slack: f32) -> Self {
         let longest = ray.direction.abs().max_element();
-        let (x_inverse, x_near, x_far) = Self::axis(ray.origin.x, ray.direction.x, longest, slack);
-        let (y_inverse, y_near, y_far) = Self::axis(ray.origin.y, ray.direction.y, longest, slack);
-        let (z_inverse, z_near, z_far) = Self::axis(ray.origin.z, ray.direction.z, longest, slack);
+        let mut inverse = Vec3::new(
+            inverse(ray.direction.x, longest),
+            inverse(ray.direction.y, longest),
+            inverse(ray.direction.z, longest),
+        );
+        let size = inverse.abs();
+        let (mut back, mut wide) = (-ray.origin * inverse, slack * size);
+        // As good as always all three are sound, so that is asked first, at once.
+        let [least, most] = SOUND;
+        if !(slack > least
+            && size.min_element() > least
+            && wide.min_element() > least
+            && wide.max_element() < most)
+        {
+            for axis in 0..3 {
+                if !(slack > least && size[axis] > least && wide[axis] > least && wide[axis] < most) {
+                    (inverse[axis], back[axis], wide[axis]) = (0.0, 0.0, f32::INFINITY);
+                }
+            }
+        }
         Self {
-            inverse: vec3x::splat(token, [x_inverse, y_inverse, z_inverse]),
-            near: vec3x::splat(token, [x_near, y_near, z_near]),
-            far: vec3x::splat(token, [x_far, y_far, z_far]),
+            inverse: vec3x::splat(token, inverse.to_array()),
+            near: vec3x::splat(token, (back - wide).to_array()),
+            far: vec3x::splat(token, (back + wide).to_array()),
             near_side: [
-                usize::from(x_inverse < 0.0),
-                usize::from(y_inverse < 0.0),
-                usize::from(z_inverse < 0.0),
+                usize::from(inverse.x < 0.0),
+                usize::from(inverse.y < 0.0),
+                usize::from(inverse.z < 0.0),
             ],
             t_min: L::splat(token, ray.t_min),
-        }
-    }
-
-    /// The inverse, and the constants of near and far planes, of one axis.
-    #[inline(always)]
-    fn axis(origin: f32, direction: f32, longest: f32, slack: f32) -> (f32, f32, f32) {
-        let inverse = inverse(direction, longest);
-        let (back, wide) = (-origin * inverse, slack * inverse.abs());
-        let [least, most] = SOUND;
-        if slack > least && inverse.abs() > least && wide > least && wide < most {
-            (inverse, back - wide, back + wide)
-        } else {
-            (0.0, f32::NEG_INFINITY, f32::INFINITY)
         }
     }
 
