@@ -94,9 +94,7 @@ fn deviations(rendered: &Rendered, expected: impl Fn(u32, u32) -> Option<f64>) -
     (difference / f64::sqrt(variance + (1e-5_f64 * count).powi(2)), squares / count)
 }
 
-/// Mean over a pixel of the product of Lambert's irradiance and a visible fraction, on a floor at y = 0.
-///
-/// The two do not vary independently over the light, so this is used where the fraction is 0, 1, or the light far.
+/// The point of the floor, y = 0, that a place in the image shows.
 fn floor_point(setting: &Setting, px: f32, py: f32) -> Vec3 {
     let direction = setting.camera.frame().ray_direction(px, py);
     setting.camera.eye + direction * (-setting.camera.eye.y / direction.y)
