@@ -1,24 +1,120 @@
-//! Shared set-up for the benchmarks: scenes, the rays they ask about, and obvhs beside us.
+//! Shared set-up for the benchmarks: scenes, the shadow rays they ask about, who answers them, and a clock.
 
 use glam::Vec3;
-use obvhs::bvh2::Bvh2;
-use obvhs::bvh2::builder::build_bvh2_from_tris;
-use obvhs::cwbvh::CwBvh;
-use obvhs::cwbvh::builder::build_cwbvh_from_tris;
-use obvhs::{BvhBuildParams, triangle};
 use occlude_host::accel::{Accel, Quality};
+use occlude_host::error::Result;
 use occlude_host::film::Tile;
 use occlude_host::generate::{Kind, generate};
-use occlude_host::integrator::{Questions, Stage, questions};
 use occlude_host::light::{AreaLight, lights};
-use occlude_host::sampler::Pattern;
+use occlude_host::sampler::{Pattern, Sampler};
 use occlude_host::scene::{CameraRequest, Scene, load};
-use occlude_kernel::lanes::detect;
-use occlude_kernel::{Bvh, Ray};
-use std::path::Path;
-use std::time::Duration;
+use occlude_kernel::lanes::{Task, detect, dispatch};
+use occlude_kernel::{Bvh, Ray, Simd, Uncounted, offset};
+use rustix::time::{ClockId, clock_gettime};
+use std::ops::Range;
+use std::path::{Path, PathBuf};
 
-/// A scene, its trees, and the shadow rays of some tiles of its picture.
+#[cfg(feature = "embree")]
+#[path = "support/embree.rs"]
+pub mod embree;
+#[path = "support/obvhs.rs"]
+pub mod obvhs;
+#[path = "support/ours.rs"]
+pub mod ours;
+#[path = "support/pack.rs"]
+pub mod pack;
+#[path = "support/record.rs"]
+pub mod record;
+
+/// What is asked: batches of shadow rays, each from a point to samples of a light.
+#[derive(Clone, Debug, Default)]
+pub struct Work {
+    /// The batches, in the order of the picture.
+    pub batches: Vec<Batch>,
+    /// The far ends of all batches, one after the other: x, y and z.
+    pub targets: [Vec<f32>; 3],
+    /// The lights: a corner and two edges.
+    pub planes: Vec<[Vec3; 3]>,
+    /// Batches that belong together: one light, and points in one tile of the picture.
+    pub tiles: Vec<Range<u32>>,
+    /// Tile and light of the last batch.
+    place: Option<(u32, u32)>,
+}
+
+/// One point and one light: up to 64 shadow rays.
+#[derive(Clone, Copy, Debug)]
+pub struct Batch {
+    /// Where the rays begin.
+    pub origin: Vec3,
+    /// Which light.
+    pub light: u32,
+    /// The first of its targets.
+    pub first: u32,
+    /// The one after the last.
+    pub last: u32,
+}
+
+impl Work {
+    /// Rays in all batches.
+    pub fn rays(&self) -> usize {
+        self.targets[0].len()
+    }
+
+    /// Every ray, in the order of the batches.
+    pub fn segments(&self) -> Vec<Ray> {
+        let [x, y, z] = &self.targets;
+        let of = |batch: &Batch| {
+            let origin = batch.origin;
+            (batch.first as usize..batch.last as usize).map(move |i| Ray::segment(origin, [x[i], y[i], z[i]]))
+        };
+        self.batches.iter().flat_map(of).collect()
+    }
+
+    /// A word for the answers of each batch.
+    pub fn answers(&self) -> Vec<u64> {
+        vec![0; self.batches.len()]
+    }
+}
+
+/// How much of a light a point sees, by 64 exact rays.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub enum Class {
+    /// All of it.
+    Lit,
+    /// Nothing.
+    Dark,
+    /// Some of it.
+    Penumbra,
+}
+
+impl Class {
+    /// All of them.
+    pub const ALL: [Self; 3] = [Self::Lit, Self::Dark, Self::Penumbra];
+
+    /// In lower case.
+    pub fn name(self) -> &'static str {
+        match self {
+            Self::Lit => "lit",
+            Self::Dark => "dark",
+            Self::Penumbra => "penumbra",
+        }
+    }
+}
+
+/// A point and a light that faces it.
+#[derive(Clone, Copy, Debug)]
+pub struct Pair {
+    x: Vec3,
+    normal: Vec3,
+    origin: Vec3,
+    pixel: u64,
+    tile: u32,
+    light: u32,
+    /// How much it sees.
+    pub class: Class,
+}
+
+/// A scene, its tree, and points its camera sees.
 #[derive(Debug)]
 pub struct Setting {
     /// What it is called.
@@ -27,104 +123,259 @@ pub struct Setting {
     pub scene: Scene,
     /// Its lights.
     pub lights: Vec<AreaLight>,
+    /// Shaded points.
+    pub points: usize,
+    /// Each of them with each of its lights, in the order of the picture.
+    pub pairs: Vec<Pair>,
+    clearance: f32,
     accel: Accel,
-    /// Shading points, their batches and targets, tile by tile.
-    pub questions: Vec<Questions>,
 }
 
+/// The picture that points are taken from, and the tiles that are taken whole.
+const SIZE: (u32, u32) = (1280, 720);
+const TILE: u32 = 8;
+
+/// The seeds of the rays measured, and of those that tell the classes.
+const SEEDS: [u64; 2] = [1, 2];
+
 impl Setting {
-    fn new(name: &str, scene: Scene, shadow_rays: u32) -> Self {
-        let accel = Accel::build(&scene, Quality::Medium);
+    /// Finds the first hits of the scene's camera in as many tiles of 8 by 8 pixels, evenly spread over the
+    /// picture, as give about so many points.
+    pub fn new(name: &str, scene: Scene, points: usize) -> Self {
+        let accel = Accel::build(&scene, Quality::default());
         let lights = lights(&scene);
-        let camera = scene.camera.expect("loaded and generated scenes have one");
-        let frame = camera.frame();
-        let stage = Stage {
-            scene: &scene,
-            bvh: accel.bvh(),
-            lights: &lights,
-            eye: camera.eye,
-            camera: &frame,
-            shadow_rays,
-            pattern: Pattern::Jittered,
-            seed: 1,
-            level: detect(),
-            count: false,
-        };
-        // Tiles spread over the picture, about 8000 points.
-        let tiles: Vec<Tile> = Tile::cover(camera.width, camera.height, 16).collect();
-        let step = (tiles.len() / 32).max(1);
-        let questions =
-            tiles.iter().step_by(step).map(|&tile| questions(&stage, tile, camera.width, 0)).collect();
-        Self { name: name.to_owned(), lights, accel, questions, scene }
+        let all = dispatch(detect(), FirstHits { bvh: accel.bvh(), scene: &scene });
+        let tiles: Vec<_> = all.chunk_by(|a, b| a.tile == b.tile).collect();
+        let each = (TILE * TILE) as usize;
+        let kept = (points / each).clamp(1, tiles.len().max(1)).min(tiles.len());
+        let clearance = accel.bvh().clearance();
+        let (mut pairs, mut points) = (Vec::new(), 0);
+        for i in 0..kept {
+            let tile = tiles[(2 * i + 1) * tiles.len() / (2 * kept)];
+            points += tile.len();
+            for (light, area) in (0..).zip(&lights) {
+                for &FirstHit { pixel, tile, x, normal } in tile {
+                    if area.unshadowed(x, normal).is_some() {
+                        let origin = offset(x, normal, clearance);
+                        pairs.push(Pair { x, normal, origin, pixel, tile, light, class: Class::Lit });
+                    }
+                }
+            }
+        }
+        let mut setting = Self { name: name.to_owned(), scene, lights, points, pairs, clearance, accel };
+        setting.classify();
+        setting
     }
 
-    /// Our tree.
+    /// Tells the classes, and drops pairs with no sample above both horizons.
+    fn classify(&mut self) {
+        let mut work = self.no_work();
+        let mut pairs = self.pairs.clone();
+        pairs.retain(|pair| self.ask(pair, 64, SEEDS[1], &mut work));
+        let mut blocked = work.answers();
+        let counter = &mut Uncounted;
+        dispatch(detect(), ours::Single { bvh: self.bvh(), work: &work, blocked: &mut blocked, counter });
+        for (pair, (batch, blocked)) in pairs.iter_mut().zip(work.batches.iter().zip(blocked)) {
+            pair.class = match blocked.count_ones() {
+                0 => Class::Lit,
+                all if all == batch.last - batch.first => Class::Dark,
+                _ => Class::Penumbra,
+            };
+        }
+        self.pairs = pairs;
+    }
+
+    fn no_work(&self) -> Work {
+        let planes = self.lights.iter().map(|light| [light.corner, light.u, light.v]).collect();
+        Work { planes, ..Work::default() }
+    }
+
+    /// The tree. It is checked, so ask once for many rays.
     pub fn bvh(&self) -> Bvh<'_> {
         self.accel.bvh()
     }
 
-    /// Every shadow ray, in the order of the batches.
-    pub fn rays(&self) -> Vec<Ray> {
-        let mut rays = Vec::new();
-        for questions in &self.questions {
-            let [x, y, z] = &questions.targets;
-            for batch in &questions.batches {
-                let origin = questions.points[batch.point as usize].origin;
-                rays.extend(batch.samples.clone().map(|i| {
-                    let i = i as usize;
-                    Ray::segment(origin, [x[i], y[i], z[i]])
-                }));
+    /// Bytes of the tree.
+    pub fn bytes(&self) -> usize {
+        self.accel.bytes()
+    }
+
+    /// The shadow rays of all pairs, or of one class: `n` stratified samples of the light each, less those below
+    /// either horizon, which a renderer would not ask about. The same rays for a pair either way.
+    pub fn work(&self, n: usize, class: Option<Class>) -> Work {
+        let mut work = self.no_work();
+        for pair in self.pairs.iter().filter(|pair| class.is_none_or(|class| class == pair.class)) {
+            self.ask(pair, n, SEEDS[0], &mut work);
+        }
+        work
+    }
+
+    /// Adds the batch of a pair, unless it has no rays.
+    fn ask(&self, pair: &Pair, n: usize, seed: u64, work: &mut Work) -> bool {
+        let light = &self.lights[pair.light as usize];
+        let first = work.rays() as u32;
+        let mut square = Vec::with_capacity(n);
+        Sampler::new(seed, pair.pixel, pair.light).points(Pattern::Jittered, n, &mut square);
+        for at in square {
+            let y = light.point(at);
+            let path = y - pair.x;
+            if light.normal.dot(path) < 0.0 && pair.normal.dot(path) > 0.0 {
+                let target = offset(y, light.normal, self.clearance);
+                for axis in 0..3 {
+                    work.targets[axis].push(target[axis]);
+                }
             }
         }
-        rays
-    }
-
-    /// The same triangles as obvhs takes them.
-    pub fn triangles(&self) -> Vec<triangle::Triangle> {
-        (0..self.scene.triangles.len() as u32)
-            .map(|i| {
-                let [v0, v1, v2] = self.scene.vertices(i).map(|v: Vec3| v.into());
-                triangle::Triangle { v0, v1, v2 }
-            })
-            .collect()
-    }
-
-    /// obvhs' binary tree, of its medium preset.
-    pub fn obvhs_binary(&self) -> Bvh2 {
-        build_bvh2_from_tris(&self.triangles(), BvhBuildParams::medium_build(), &mut Duration::default())
-    }
-
-    /// obvhs' compressed wide tree, of its medium preset.
-    pub fn obvhs_wide(&self) -> CwBvh {
-        build_cwbvh_from_tris(&self.triangles(), BvhBuildParams::medium_build(), &mut Duration::default())
+        let last = work.rays() as u32;
+        if last > first {
+            let index = work.batches.len() as u32;
+            let place = (pair.tile, pair.light);
+            match work.tiles.last_mut() {
+                Some(tile) if work.place == Some(place) => tile.end = index + 1,
+                _ => work.tiles.push(index..index + 1),
+            }
+            work.place = Some(place);
+            work.batches.push(Batch { origin: pair.origin, light: pair.light, first, last });
+        }
+        last > first
     }
 }
 
-/// Scenes of the repository, generated ones, and those of `../shared/scenes` where there are any.
-pub fn settings(shadow_rays: u32) -> Vec<Setting> {
+/// A point that the camera sees.
+#[derive(Clone, Copy)]
+struct FirstHit {
+    pixel: u64,
+    tile: u32,
+    x: Vec3,
+    normal: Vec3,
+}
+
+/// All of them that reflect, in tiles.
+struct FirstHits<'a> {
+    bvh: Bvh<'a>,
+    scene: &'a Scene,
+}
+
+impl Task for FirstHits<'_> {
+    type Output = Vec<FirstHit>;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> Vec<FirstHit> {
+        let bvh = self.bvh.on(simd);
+        let (width, height) = SIZE;
+        let mut found = Vec::new();
+        let Some(mut camera) = self.scene.camera else { return found };
+        (camera.width, camera.height) = SIZE;
+        let frame = camera.frame();
+        for (index, tile) in (0..).zip(Tile::cover(width, height, TILE)) {
+            for pixel in 0..tile.len() {
+                let (px, py) = tile.position(pixel);
+                let toward = frame.ray_direction(px as f32 + 0.5, py as f32 + 0.5);
+                let ray = Ray::from(camera.eye, toward);
+                let Some(hit) = bvh.closest(&ray, None, &mut Uncounted) else { continue };
+                let [a, b, c] = self.scene.vertices(hit.triangle);
+                let across = (b - a).as_dvec3().cross((c - a).as_dvec3());
+                let Some(normal) = across.try_normalize() else { continue };
+                if self.scene.material(hit.triangle).diffuse.max_element() <= 0.0 {
+                    continue;
+                }
+                let normal = normal.as_vec3();
+                found.push(FirstHit {
+                    pixel: u64::from(py) * u64::from(width) + u64::from(px),
+                    tile: index,
+                    x: a * (1.0 - hit.u - hit.v) + b * hit.u + c * hit.v,
+                    normal: if normal.dot(toward) < 0.0 { normal } else { -normal },
+                });
+            }
+        }
+        found
+    }
+}
+
+/// Scenes of `../shared/scenes`.
+pub const SHARED: [&str; 6] =
+    ["cornell_original", "bunny_penumbra", "sponza_part", "teapot_toys", "apple_tree", "vented_case"];
+
+/// Scenes of the repository.
+pub const OWN: [&str; 5] = ["cornell", "columns", "fence", "half_plane", "plates"];
+
+/// Triangles of a generated scene unless its name says otherwise.
+const GENERATED: usize = 100_000;
+
+/// Where a scene comes from.
+#[derive(Clone, Debug, PartialEq, Eq)]
+pub enum Source {
+    /// A folder, which may be absent.
+    Folder(PathBuf),
+    /// Made of about so many triangles.
+    Made(Kind, usize),
+}
+
+/// The scene of a name: one of [`SHARED`], one of [`OWN`], or a kind of generated scene with or without a number
+/// of triangles, `hair` or `hair:1000000`.
+pub fn source(name: &str) -> Option<Source> {
     let root = Path::new(env!("CARGO_MANIFEST_DIR")).join("..");
-    let mut settings = Vec::new();
-    for name in ["cornell", "columns"] {
-        match load(&root.join("scenes").join(name), &CameraRequest::default()) {
-            Ok(scene) => settings.push(Setting::new(name, scene, shadow_rays)),
-            Err(error) => eprintln!("skipped: {error}"),
+    if SHARED.contains(&name) {
+        return Some(Source::Folder(shared_folder().join(name)));
+    }
+    if OWN.contains(&name) {
+        return Some(Source::Folder(root.join("scenes").join(name)));
+    }
+    let (kind, triangles) = name.split_once(':').unwrap_or((name, ""));
+    let kind = Kind::ALL.into_iter().find(|known| known.name() == kind)?;
+    let triangles = if name.contains(':') { triangles.parse().ok()? } else { GENERATED };
+    Some(Source::Made(kind, triangles))
+}
+
+/// Where the shared scenes are: beside the repository, or where `OCCLUDE_SCENES` says.
+pub fn shared_folder() -> PathBuf {
+    let beside = || Path::new(env!("CARGO_MANIFEST_DIR")).join("../../shared/scenes");
+    std::env::var_os("OCCLUDE_SCENES").map_or_else(beside, PathBuf::from)
+}
+
+/// The scene of a name. `None`, with a message, if its folder is absent or there is no such name.
+pub fn scene(name: &str) -> Option<Result<Scene>> {
+    match source(name) {
+        Some(Source::Made(kind, triangles)) => Some(Ok(generate(kind, 1, triangles))),
+        Some(Source::Folder(folder)) if folder.exists() => Some(load(&folder, &CameraRequest::default())),
+        Some(Source::Folder(folder)) => {
+            eprintln!("skipped: {name} is not at {}", folder.display());
+            None
+        }
+        None => {
+            eprintln!("skipped: no scene is called {name}");
+            None
         }
     }
-    for kind in [Kind::Spheres, Kind::Hair] {
-        settings.push(Setting::new(kind.name(), generate(kind, 1, 100_000), shadow_rays));
+}
+
+/// Scenes of the repository, generated ones, and the shared ones where there are any.
+pub fn settings(points: usize) -> Vec<Setting> {
+    let names = ["cornell", "columns", "spheres", "hair"].into_iter().chain(SHARED);
+    names
+        .filter_map(|name| match scene(name)? {
+            Ok(scene) => Some(Setting::new(name, scene, points)),
+            Err(error) => {
+                eprintln!("skipped: {error}");
+                None
+            }
+        })
+        .collect()
+}
+
+/// CPU time of this thread, in seconds: other processes hardly show in it.
+pub fn thread_time() -> f64 {
+    let time = clock_gettime(ClockId::ThreadCPUTime);
+    time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
+}
+
+/// The middle one; of two middle ones their mean. NaN of nothing.
+pub fn median(values: &mut [f64]) -> f64 {
+    values.sort_by(f64::total_cmp);
+    let half = values.len() / 2;
+    match values.len() {
+        0 => f64::NAN,
+        odd if odd % 2 == 1 => values[half],
+        _ => (values[half - 1] + values[half]) / 2.0,
     }
-    for name in
-        ["cornell_original", "bunny_penumbra", "sponza_part", "teapot_toys", "apple_tree", "vented_case"]
-    {
-        let folder = root.join("../shared/scenes").join(name);
-        if !folder.exists() {
-            eprintln!("skipped: {name} is not at ../shared/scenes");
-            continue;
-        }
-        match load(&folder, &CameraRequest::default()) {
-            Ok(scene) => settings.push(Setting::new(name, scene, shadow_rays)),
-            Err(error) => eprintln!("skipped: {error}"),
-        }
-    }
-    settings
 }

@@ -1,7 +1,7 @@
 //! One point and many points on a light: which of the segments are blocked?
 
 use super::Bvh;
-use super::packet::{Any, Rays};
+use super::packet::{Any, Nobody, Rays};
 use super::pyramid::{MOST, NO_STACK, Pyramid, Stack};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
@@ -192,7 +192,7 @@ impl<S: Simd> Bvh<'_, S> {
                 t_min: S::Packet::splat(token, 0.0),
                 t_max: S::Packet::splat(token, 1.0),
             };
-            let mut any = Any { blocked: 0, note: |_, _| () };
+            let mut any = Any { blocked: 0, note: Nobody };
             self.traverse_rays(&rays, (1 << rest) - 1, ignore, counter, &mut any);
             blocked |= u64::from(any.blocked) << done;
             done += width;

@@ -35,19 +35,48 @@ pub(super) trait PacketVisitor<L: Lanes> {
     fn hits(&mut self, bits: u32, triangle: u32, found: &Found, t_max: &mut [f32; 16]) -> u32;
 }
 
-/// Ends each ray at its first hit.
-pub(super) struct Any<F> {
-    pub(super) blocked: u32,
-    pub(super) note: F,
+/// Hears of the rays, by bits, that a triangle blocks.
+pub(super) trait Note {
+    fn note(&mut self, bits: u32, triangle: u32);
 }
 
-impl<L: Lanes, F: FnMut(u32, u32)> PacketVisitor<L> for Any<F> {
+/// Does not care.
+pub(super) struct Nobody;
+
+impl Note for Nobody {
+    #[inline(always)]
+    fn note(&mut self, _: u32, _: u32) {}
+}
+
+/// Keeps the triangle of each ray, counted from the `from`th.
+struct Occluders<'o> {
+    from: usize,
+    occluders: &'o mut [Option<u32>; RayPacket::WIDTH],
+}
+
+impl Note for Occluders<'_> {
+    #[inline(always)]
+    fn note(&mut self, mut bits: u32, triangle: u32) {
+        while bits != 0 {
+            self.occluders[(self.from + bits.trailing_zeros() as usize) & 15] = Some(triangle);
+            bits &= bits - 1;
+        }
+    }
+}
+
+/// Ends each ray at its first hit.
+pub(super) struct Any<N> {
+    pub(super) blocked: u32,
+    pub(super) note: N,
+}
+
+impl<L: Lanes, N: Note> PacketVisitor<L> for Any<N> {
     const ORDERED: bool = false;
 
     #[inline(always)]
     fn hits(&mut self, bits: u32, triangle: u32, _: &Found, _: &mut [f32; 16]) -> u32 {
         self.blocked |= bits;
-        (self.note)(bits, triangle);
+        self.note.note(bits, triangle);
         bits
     }
 }
@@ -111,11 +140,13 @@ impl<S: Simd> Bvh<'_, S> {
         counter: &mut impl Counter,
     ) -> u32 {
         let mut blocked = 0;
-        self.chunks(rays, active, counter, |chunk, active, from, counter| {
-            let mut any = Any { blocked: 0, note: |_, _| () };
-            self.traverse_rays(chunk, active, ignore, counter, &mut any);
+        let mut from = 0;
+        while from < RayPacket::WIDTH {
+            let mut any = Any { blocked: 0, note: Nobody };
+            self.traverse_chunk(rays, active, from, ignore, counter, &mut any);
             blocked |= any.blocked << from;
-        });
+            from += S::Packet::WIDTH;
+        }
         blocked
     }
 
@@ -129,15 +160,12 @@ impl<S: Simd> Bvh<'_, S> {
         counter: &mut impl Counter,
     ) -> [Option<u32>; RayPacket::WIDTH] {
         let mut occluders = [None; RayPacket::WIDTH];
-        self.chunks(rays, active, counter, |chunk, active, from, counter| {
-            let note = |mut bits: u32, triangle: u32| {
-                while bits != 0 {
-                    occluders[(from + bits.trailing_zeros() as usize) & 15] = Some(triangle);
-                    bits &= bits - 1;
-                }
-            };
-            self.traverse_rays(chunk, active, ignore, counter, &mut Any { blocked: 0, note });
-        });
+        let mut from = 0;
+        while from < RayPacket::WIDTH {
+            let note = Occluders { from, occluders: &mut occluders };
+            self.traverse_chunk(rays, active, from, ignore, counter, &mut Any { blocked: 0, note });
+            from += S::Packet::WIDTH;
+        }
         occluders
     }
 
@@ -152,9 +180,12 @@ impl<S: Simd> Bvh<'_, S> {
     ) -> HitPacket {
         let nothing = Hit { t: 0.0, u: 0.0, v: 0.0, triangle: 0 };
         let mut best = HitPacket { hit: 0, hits: [nothing; RayPacket::WIDTH] };
-        self.chunks(rays, active, counter, |chunk, active, from, counter| {
-            self.traverse_rays(chunk, active, ignore, counter, &mut Closest { from, best: &mut best });
-        });
+        let mut from = 0;
+        while from < RayPacket::WIDTH {
+            let mut closest = Closest { from, best: &mut best };
+            self.traverse_chunk(rays, active, from, ignore, counter, &mut closest);
+            from += S::Packet::WIDTH;
+        }
         best
     }
 
@@ -169,35 +200,39 @@ impl<S: Simd> Bvh<'_, S> {
         counter: &mut impl Counter,
         mut visit: impl FnMut(usize, Hit) -> ControlFlow<()>,
     ) {
-        self.chunks(rays, active, counter, |chunk, active, from, counter| {
-            self.traverse_rays(chunk, active, ignore, counter, &mut Each { from, visit: &mut visit });
-        });
+        let mut from = 0;
+        while from < RayPacket::WIDTH {
+            let mut each = Each { from, visit: &mut visit };
+            self.traverse_chunk(rays, active, from, ignore, counter, &mut each);
+            from += S::Packet::WIDTH;
+        }
     }
 
-    /// Hands out a packet as many rays at a time as a vector holds.
+    /// Asks about as many rays from the `from`th on as a vector holds.
+    ///
+    /// The callers' loops are spelt out: a closure would not be compiled for the instructions of a task.
     #[inline(always)]
-    fn chunks<C: Counter>(
+    fn traverse_chunk<V: PacketVisitor<S::Packet>>(
         &self,
         rays: &RayPacket,
         active: u32,
-        counter: &mut C,
-        mut ask: impl FnMut(&Rays<S::Packet>, u32, usize, &mut C),
+        from: usize,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        visitor: &mut V,
     ) {
         let token = self.simd.token();
-        let width = S::Packet::WIDTH;
-        for from in (0..RayPacket::WIDTH).step_by(width) {
-            let active = active >> from & ((1 << width) - 1);
-            if active == 0 {
-                continue;
-            }
-            let chunk = Rays {
-                origin: vec3x::load(token, &rays.origin, from),
-                direction: vec3x::load(token, &rays.direction, from),
-                t_min: S::Packet::load(token, &rays.t_min[from..]),
-                t_max: S::Packet::load(token, &rays.t_max[from..]),
-            };
-            ask(&chunk, active, from, counter);
+        let active = active >> from & ((1 << S::Packet::WIDTH) - 1);
+        if active == 0 {
+            return;
         }
+        let chunk = Rays {
+            origin: vec3x::load(token, &rays.origin, from),
+            direction: vec3x::load(token, &rays.direction, from),
+            t_min: S::Packet::load(token, &rays.t_min[from..]),
+            t_max: S::Packet::load(token, &rays.t_max[from..]),
+        };
+        self.traverse_rays(&chunk, active, ignore, counter, visitor);
     }
 
     /// Asks about the rays of `active`, those of one dominant axis at a time.
