@@ -11,6 +11,7 @@ use occlude_benches::record::{Cell, Record, SceneRow};
 use occlude_benches::{Class, OWN, SHARED, Setting, Work, median, obvhs, scene, thread_time};
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::generate::Kind;
+use occlude_kernel::Counts;
 use occlude_kernel::lanes::{Level, detect, level_name, level_named};
 use std::path::PathBuf;
 use std::time::Instant;
@@ -37,6 +38,9 @@ struct Options {
     /// Only all points together, not the classes apart.
     #[arg(long)]
     overall: bool,
+    /// Also print how many tests our queries make.
+    #[arg(long)]
+    counts: bool,
     /// Write NAME.csv and NAME.md.
     #[arg(short, long, value_name = "NAME")]
     output: Option<PathBuf>,
@@ -139,6 +143,9 @@ fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Reco
                 continue;
             }
             let class = class.map_or("all", Class::name);
+            if options.counts {
+                count(level, setting, &work, class);
+            }
             let cells = contest(&peers, &work, options.runs);
             for mut cell in cells {
                 cell.scene.clone_from(&setting.name);
@@ -149,6 +156,22 @@ fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Reco
         }
     }
     record.scenes.push(row);
+}
+
+/// Tests a pair of point and light, query by query.
+fn count(level: Level, setting: &Setting, work: &Work, class: &str) {
+    let pairs = work.batches.len() as f64;
+    for method in METHODS {
+        let mut counts = Counts::default();
+        (method.count)(level, setting.bvh(), work, &mut work.answers(), &mut counts);
+        eprintln!(
+            "{} {class}, {}: {:.1} nodes visited by a ray or a bundle, {:.1} triangle tests a point and light",
+            setting.name,
+            method.name,
+            counts.node_tests as f64 / 8.0 / pairs,
+            counts.triangle_tests as f64 / pairs,
+        );
+    }
 }
 
 /// Times shorter than this say little, so short work is done several times over.

@@ -4,7 +4,7 @@ use crate::Work;
 use crate::pack::{Tracer, pack};
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
-use occlude_kernel::{BatchScratch, Bvh, Counter, Counts, Ray, RayPacket, Simd, Targets, Uncounted};
+use occlude_kernel::{BatchScratch, Bvh, Counter, Counts, Ray, RayPacket, Simd, Targets, TilePoint, TileScratch, Uncounted};
 
 /// One way to answer.
 #[derive(Clone, Copy)]
@@ -37,6 +37,7 @@ pub const METHODS: &[Method] = methods! {
     "single" => Single,
     "packet" => Packets,
     "batch" => Batches,
+    "tile" => Tiles,
 };
 
 /// [`Bvh::occluded`], ray by ray.
@@ -157,6 +158,59 @@ impl<C: Counter> Task for Batches<'_, C> {
                 let targets = targets.on_parallelogram(corner, u, v);
                 let word = &mut self.blocked[index..=index];
                 bvh.occluded_batch(batch.origin, &targets, None, self.counter, &mut scratch, word);
+            }
+            index += 1;
+        }
+    }
+}
+
+/// [`Bvh::occluded_tile`], by the rays of neighbouring points to a light.
+pub struct Tiles<'a, C> {
+    bvh: Bvh<'a>,
+    work: &'a Work,
+    blocked: &'a mut [u64],
+    counter: &'a mut C,
+}
+
+impl<C: Counter> Task for Tiles<'_, C> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) {
+        let bvh = self.bvh.on(simd);
+        let [x, y, z] = &self.work.targets;
+        let mut scratch = TileScratch::new();
+        let mut points = [TilePoint::default(); 64];
+        let mut answers = [0; 64];
+        let mut index = 0;
+        while index < self.work.tiles.len() {
+            let range = &self.work.tiles[index];
+            let (begin, end) = (range.start as usize, range.end as usize);
+            let first = self.work.batches[begin].first;
+            let mut k = begin;
+            while k < end {
+                let batch = &self.work.batches[k];
+                let count = batch.last - batch.first;
+                points[k - begin] = TilePoint { x: batch.origin.to_array(), first: batch.first - first, count };
+                k += 1;
+            }
+            let (from, to) = (first as usize, self.work.batches[end - 1].last as usize);
+            if let Some(targets) = Targets::new(&x[from..to], &y[from..to], &z[from..to]) {
+                let [corner, u, v] = self.work.planes[self.work.batches[begin].light as usize];
+                let targets = targets.on_parallelogram(corner, u, v);
+                let points = &points[..end - begin];
+                bvh.occluded_tile(points, &targets, None, self.counter, &mut scratch, &mut answers);
+            }
+            let mut k = begin;
+            while k < end {
+                let TilePoint { first, count, .. } = points[k - begin];
+                let (word, bit) = (first as usize / 64, first % 64);
+                let mut bits = answers[word] >> bit;
+                if bit != 0 && word + 1 < answers.len() {
+                    bits |= answers[word + 1] << (64 - bit);
+                }
+                self.blocked[k] = bits & u64::MAX.checked_shr(64 - count).unwrap_or(0);
+                k += 1;
             }
             index += 1;
         }

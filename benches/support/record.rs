@@ -70,7 +70,7 @@ impl Cell {
 }
 
 /// The one of ours that a renderer uses.
-const OURS: &str = "batch";
+const OURS: &str = "tile";
 
 impl SceneRow {
     /// One line of plain text.

@@ -32,7 +32,7 @@ pub mod ray;
 pub mod triangle;
 mod vec3x;
 
-pub use bvh::{BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Targets, offset};
+pub use bvh::{BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Targets, TilePoint, TileScratch, offset};
 pub use counter::{Counter, Counts, Uncounted};
 pub use lanes::{Native, Scalar, Simd};
 pub use ray::{Hit, Ray, RayPacket};

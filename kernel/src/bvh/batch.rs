@@ -1,8 +1,8 @@
 //! One point and many points on a light: which of the segments are blocked?
 
 use super::Bvh;
-use super::packet::{Any, Nobody, Rays};
-use super::pyramid::{MOST, NO_STACK, Pyramid, Stack};
+use super::packet::{Any, Rays, Start};
+use super::pyramid::{Forgetful, Learn, Learner, MOST, Pyramid, Stack};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::vec3x;
@@ -36,6 +36,15 @@ impl<'a> Targets<'a> {
     ) -> Self {
         let plane = [Vec3::from(corner.into()), Vec3::from(u.into()), Vec3::from(v.into())];
         Self { plane: Some(plane), ..self }
+    }
+
+    /// Three unit vectors at right angles, two of them in the light's plane if it is known.
+    #[inline(always)]
+    pub(super) fn turn(&self) -> [Vec3; 3] {
+        match self.plane {
+            Some([_, u, v]) => super::tile::frame(u.cross(v), u),
+            None => [Vec3::X, Vec3::Y, Vec3::Z],
+        }
     }
 
     /// The coordinates along an axis.
@@ -106,14 +115,14 @@ impl<'a> Targets<'a> {
 
 /// What a batch works in: keep one a thread, so that nothing is cleared between queries. About six kilobytes.
 pub struct BatchScratch {
-    pyramid: Pyramid,
-    stack: Stack,
+    pub(super) pyramid: Pyramid,
+    pub(super) stack: Stack,
 }
 
 impl BatchScratch {
     /// Ready for any query.
     pub const fn new() -> Self {
-        Self { pyramid: Pyramid::EMPTY, stack: NO_STACK }
+        Self { pyramid: Pyramid::EMPTY, stack: Stack::new_const() }
     }
 }
 
@@ -152,11 +161,11 @@ impl<S: Simd> Bvh<'_, S> {
         while from < targets.len() {
             let count = (targets.len() - from).min(MOST);
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
-                self.packets_blocked(x, targets, from, count, ignore, counter)
+                self.packets_from_root(x, targets, from, count, ignore, counter)
             } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
                 self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, ignore, counter)
             } else {
-                self.packets_blocked(x, targets, from, count, ignore, counter)
+                self.packets_from_root(x, targets, from, count, ignore, counter)
             };
             from += MOST;
         }
@@ -164,7 +173,7 @@ impl<S: Simd> Bvh<'_, S> {
 
     /// The same for up to 64 targets, in packets.
     #[inline(always)]
-    fn packets_blocked(
+    pub(super) fn packets_from_root(
         &self,
         x: [f32; 3],
         targets: &Targets<'_>,
@@ -173,6 +182,25 @@ impl<S: Simd> Bvh<'_, S> {
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
+        let (start, ask) = (Start::ROOT, u64::MAX);
+        self.packets_blocked(&start, x, targets, first, count, ask, ignore, counter, &mut Forgetful)
+    }
+
+    /// The same for those of `ask` of up to 64 targets, in packets.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    pub(super) fn packets_blocked(
+        &self,
+        start: &Start<'_>,
+        x: [f32; 3],
+        targets: &Targets<'_>,
+        first: usize,
+        count: usize,
+        ask: u64,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        learner: &mut impl Learner,
+    ) -> u64 {
         let token = self.simd.token();
         let width = S::Packet::WIDTH;
         let mut blocked = 0;
@@ -180,21 +208,24 @@ impl<S: Simd> Bvh<'_, S> {
         let mut done = 0;
         while done < count {
             let (from, rest) = (first + done, (count - done).min(width));
-            let origin = vec3x::splat(token, x);
-            let ends = [
-                ends_of::<S>(token, targets.x, from, rest, &mut tail),
-                ends_of::<S>(token, targets.y, from, rest, &mut tail),
-                ends_of::<S>(token, targets.z, from, rest, &mut tail),
-            ];
-            let rays = Rays {
-                origin,
-                direction: vec3x::sub(ends, origin),
-                t_min: S::Packet::splat(token, 0.0),
-                t_max: S::Packet::splat(token, 1.0),
-            };
-            let mut any = Any { blocked: 0, note: Nobody };
-            self.traverse_rays(&rays, (1 << rest) - 1, ignore, counter, &mut any);
-            blocked |= u64::from(any.blocked) << done;
+            let active = (ask >> done) as u32 & ((1 << rest) - 1);
+            if active != 0 {
+                let origin = vec3x::splat(token, x);
+                let ends = [
+                    ends_of::<S>(token, targets.x, from, rest, &mut tail),
+                    ends_of::<S>(token, targets.y, from, rest, &mut tail),
+                    ends_of::<S>(token, targets.z, from, rest, &mut tail),
+                ];
+                let rays = Rays {
+                    origin,
+                    direction: vec3x::sub(ends, origin),
+                    t_min: S::Packet::splat(token, 0.0),
+                    t_max: S::Packet::splat(token, 1.0),
+                };
+                let mut any = Any { blocked: 0, note: Learn(learner) };
+                self.traverse_rays(start, &rays, active, ignore, counter, &mut any);
+                blocked |= u64::from(any.blocked) << done;
+            }
             done += width;
         }
         blocked
@@ -202,7 +233,7 @@ impl<S: Simd> Bvh<'_, S> {
 }
 
 /// Below this many targets a pyramid costs more than it saves.
-const FEW: usize = 4;
+pub(super) const FEW: usize = 4;
 
 /// The coordinates of up to a vector's width of targets; lanes beyond the last hold anything.
 #[inline(always)]

@@ -15,11 +15,14 @@
 mod batch;
 mod packet;
 mod pyramid;
+mod shaft;
 mod single;
 mod slabs;
+mod tile;
 
 pub use batch::{BatchScratch, Targets};
 pub use packet::HitPacket;
+pub use tile::{TilePoint, TileScratch};
 
 use crate::lanes::{Native, Simd};
 use crate::triangle::{NO_TRIANGLE, TriangleBlock};
@@ -185,8 +188,11 @@ pub struct Bvh<'a, S = Native> {
 /// Levels of nodes a tree may have.
 pub const MAX_DEPTH: usize = 32;
 
+/// Subtrees that a tile's shaft may leave to begin with.
+const CUT: usize = 16;
+
 /// What a stack of nodes yet to visit must hold: each level leaves up to seven behind.
-const STACK: usize = MAX_DEPTH * (Node::WIDTH - 1) + 1;
+const STACK: usize = MAX_DEPTH * (Node::WIDTH - 1) + CUT;
 
 /// One unit in the last place of 1, halved: how far rounding moves a number, relative to it.
 const ROUNDING: f32 = f32::EPSILON / 2.0;

@@ -1,12 +1,13 @@
 //! Several rays at a time, one a lane: one box or one triangle a step.
 
-use super::slabs::{PacketSlabs, SHORTEST};
+use super::slabs::{PacketSlabs, SHORTEST, Slabs};
 use super::{Bvh, Child, Node, STACK, counts};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::{Hit, RayPacket};
 use crate::triangle::{Axes, Found, Sheared, TriangleBlock};
 use crate::vec3x::{self, Vec3x};
+use arrayvec::ArrayVec;
 use core::ops::ControlFlow;
 
 /// The nearest hits of a packet.
@@ -31,13 +32,16 @@ pub(super) trait PacketVisitor<L: Lanes> {
     /// Whether `t_max` shrinks, so that near boxes come first.
     const ORDERED: bool;
 
-    /// Takes hits on one triangle: rays of `bits`. Gives the rays that need no more.
-    fn hits(&mut self, bits: u32, triangle: u32, found: &Found, t_max: &mut [f32; 16]) -> u32;
+    /// Whether a ray needs no more than one hit, and of that no more than the triangle.
+    const ANY: bool = false;
+
+    /// Takes hits on the triangle in a lane of a block: rays of `bits`. Gives the rays that need no more.
+    fn hits(&mut self, bits: u32, block: &TriangleBlock, lane: usize, found: &Found, t_max: &mut [f32; 16]) -> u32;
 }
 
-/// Hears of the rays, by bits, that a triangle blocks.
+/// Hears of the rays, by bits, that the triangle in a lane of a block blocks.
 pub(super) trait Note {
-    fn note(&mut self, bits: u32, triangle: u32);
+    fn note(&mut self, bits: u32, block: &TriangleBlock, lane: usize);
 }
 
 /// Does not care.
@@ -45,7 +49,7 @@ pub(super) struct Nobody;
 
 impl Note for Nobody {
     #[inline(always)]
-    fn note(&mut self, _: u32, _: u32) {}
+    fn note(&mut self, _: u32, _: &TriangleBlock, _: usize) {}
 }
 
 /// Keeps the triangle of each ray, counted from the `from`th.
@@ -56,9 +60,9 @@ struct Occluders<'o> {
 
 impl Note for Occluders<'_> {
     #[inline(always)]
-    fn note(&mut self, mut bits: u32, triangle: u32) {
+    fn note(&mut self, mut bits: u32, block: &TriangleBlock, lane: usize) {
         while bits != 0 {
-            self.occluders[(self.from + bits.trailing_zeros() as usize) & 15] = Some(triangle);
+            self.occluders[(self.from + bits.trailing_zeros() as usize) & 15] = Some(block.ids[lane]);
             bits &= bits - 1;
         }
     }
@@ -72,11 +76,12 @@ pub(super) struct Any<N> {
 
 impl<L: Lanes, N: Note> PacketVisitor<L> for Any<N> {
     const ORDERED: bool = false;
+    const ANY: bool = true;
 
     #[inline(always)]
-    fn hits(&mut self, bits: u32, triangle: u32, _: &Found, _: &mut [f32; 16]) -> u32 {
+    fn hits(&mut self, bits: u32, block: &TriangleBlock, lane: usize, _: &Found, _: &mut [f32; 16]) -> u32 {
         self.blocked |= bits;
-        self.note.note(bits, triangle);
+        self.note.note(bits, block, lane);
         bits
     }
 }
@@ -90,7 +95,15 @@ impl<L: Lanes> PacketVisitor<L> for Closest<'_> {
     const ORDERED: bool = true;
 
     #[inline(always)]
-    fn hits(&mut self, mut bits: u32, triangle: u32, found: &Found, t_max: &mut [f32; 16]) -> u32 {
+    fn hits(
+        &mut self,
+        mut bits: u32,
+        block: &TriangleBlock,
+        place: usize,
+        found: &Found,
+        t_max: &mut [f32; 16],
+    ) -> u32 {
+        let triangle = block.ids[place];
         while bits != 0 {
             let lane = bits.trailing_zeros() as usize & 15;
             bits &= bits - 1;
@@ -116,7 +129,15 @@ impl<L: Lanes, F: FnMut(usize, Hit) -> ControlFlow<()>> PacketVisitor<L> for Eac
     const ORDERED: bool = false;
 
     #[inline(always)]
-    fn hits(&mut self, mut bits: u32, triangle: u32, found: &Found, _: &mut [f32; 16]) -> u32 {
+    fn hits(
+        &mut self,
+        mut bits: u32,
+        block: &TriangleBlock,
+        place: usize,
+        found: &Found,
+        _: &mut [f32; 16],
+    ) -> u32 {
+        let triangle = block.ids[place];
         let mut done = 0;
         while bits != 0 {
             let lane = bits.trailing_zeros() as usize & 15;
@@ -128,6 +149,59 @@ impl<L: Lanes, F: FnMut(usize, Hit) -> ControlFlow<()>> PacketVisitor<L> for Eac
         done
     }
 }
+
+/// The rays of a packet, one by one, as the tests of one ray want them.
+struct Ends {
+    filled: bool,
+    slabs: [[[f32; 16]; 3]; 3],
+    origin: [[f32; 16]; 3],
+    direction: [[f32; 16]; 3],
+    shear: [[f32; 16]; 3],
+    t_min: [f32; 16],
+}
+
+impl Ends {
+    const NONE: Self = Self {
+        filled: false,
+        slabs: [[[0.0; 16]; 3]; 3],
+        origin: [[0.0; 16]; 3],
+        direction: [[0.0; 16]; 3],
+        shear: [[0.0; 16]; 3],
+        t_min: [0.0; 16],
+    };
+
+    #[inline(always)]
+    fn fill<L: Lanes>(&mut self, slabs: &PacketSlabs<L>, sheared: &Sheared<L>) {
+        if !self.filled {
+            self.filled = true;
+            slabs.store(&mut self.slabs);
+            let mut axis = 0;
+            while axis < 3 {
+                sheared.origin[axis].store(&mut self.origin[axis]);
+                sheared.direction[axis].store(&mut self.direction[axis]);
+                sheared.shear[axis].store(&mut self.shear[axis]);
+                axis += 1;
+            }
+            sheared.t_min.store(&mut self.t_min);
+        }
+    }
+
+    /// The same numbers as in the packet's lane: shear and origin decide answers.
+    #[inline(always)]
+    fn sheared<L: Lanes>(&self, token: L::Token, axes: Axes, lane: usize, t_max: f32) -> Sheared<L> {
+        Sheared {
+            axes,
+            origin: vec3x::broadcast(token, &self.origin, lane),
+            direction: vec3x::broadcast(token, &self.direction, lane),
+            shear: vec3x::broadcast(token, &self.shear, lane),
+            t_min: L::splat(token, self.t_min[lane]),
+            t_max: L::splat(token, t_max),
+        }
+    }
+}
+
+/// As many rays of a packet or fewer go on one by one.
+const ALONE: u32 = 5;
 
 impl<S: Simd> Bvh<'_, S> {
     /// Which of the rays of `active` does anything but `ignore` block? A bit for each.
@@ -232,13 +306,14 @@ impl<S: Simd> Bvh<'_, S> {
             t_min: S::Packet::load(token, &rays.t_min[from..]),
             t_max: S::Packet::load(token, &rays.t_max[from..]),
         };
-        self.traverse_rays(&chunk, active, ignore, counter, visitor);
+        self.traverse_rays(&Start::ROOT, &chunk, active, ignore, counter, visitor);
     }
 
     /// Asks about the rays of `active`, those of one dominant axis at a time.
     #[inline(always)]
     pub(super) fn traverse_rays<V: PacketVisitor<S::Packet>>(
         &self,
+        start: &Start<'_>,
         rays: &Rays<S::Packet>,
         active: u32,
         ignore: Option<u32>,
@@ -265,12 +340,12 @@ impl<S: Simd> Bvh<'_, S> {
 
         let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
         let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
-        let slabs = PacketSlabs::new(token, rays.origin, rays.direction, rays.t_min, slack);
+        let slabs = PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
         let mut axis = 0;
         while axis < 3 {
             let active = [along_x, along_y, along_z][axis];
             if active != 0 {
-                self.traverse_packet(rays, &slabs, Axes::of(axis), active, ignore, counter, visitor);
+                self.traverse_packet(start, rays, &slabs, Axes::of(axis), active, ignore, counter, visitor);
             }
             axis += 1;
         }
@@ -280,90 +355,187 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     fn traverse_packet<V: PacketVisitor<S::Packet>>(
         &self,
+        start: &Start<'_>,
         rays: &Rays<S::Packet>,
         slabs: &PacketSlabs<S::Packet>,
         axes: Axes,
-        mut active: u32,
+        active: u32,
         ignore: Option<u32>,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
         let token = self.simd.token();
-        let mut sheared = Sheared::new(token, axes, rays.origin, rays.direction, rays.t_min, rays.t_max);
-        let mut t_max = [0.0f32; 16];
-        sheared.t_max.store(&mut t_max);
-        let mut found = Found::NOTHING;
+        let sheared = Sheared::new(token, axes, rays.origin, rays.direction, rays.t_min, rays.t_max);
+        let mut this =
+            Going { sheared, t_max: [0.0; 16], found: Found::NOTHING, active, entry: [0.0; 16] };
+        this.sheared.t_max.store(&mut this.t_max);
         // The child, the rays that meet its box, and where the first of them enters it.
-        let mut stack = [(Child::NONE, 0u32, 0.0f32); STACK];
-        let mut len = 1;
-        stack[0] = (Child::node(0), active, 0.0);
-        while len > 0 {
-            len -= 1;
-            let (next, meet, _) = stack[len];
-            let meet = meet & active;
+        let mut stack = ArrayVec::<(Child, u32, f32), STACK>::new();
+        // Rays one by one, once they are wanted.
+        let mut ends = Ends::NONE;
+        let mut k = 0;
+        while k < start.blocks.len() {
+            self.meet_block(&start.blocks[k], active, &mut this, ignore, counter, visitor);
+            if this.active == 0 {
+                return;
+            }
+            k += 1;
+        }
+        if start.root {
+            stack.push((Child::node(0), active, 0.0));
+        }
+        let mut k = 0;
+        while k < start.entries.len() {
+            let (child, _, may) = start.entries[k];
+            stack.push((child, (may >> start.shift) as u32 & active, 0.0));
+            k += 1;
+        }
+        let mut k = 0;
+        while k < start.nodes.len() {
+            self.meet_node::<V>(&start.nodes[k], this.active, slabs, &mut this, &mut stack, counter);
+            k += 1;
+        }
+        while let Some((next, meet, _)) = stack.pop() {
+            let meet = meet & this.active;
             if meet == 0 {
                 continue;
             }
-            if next.is_leaf() {
-                let block = &self.blocks[next.index()];
-                for lane in 0..TriangleBlock::WIDTH {
-                    let id = block.ids[lane];
-                    if id == crate::triangle::NO_TRIANGLE {
-                        break;
-                    }
-                    counter.triangle_tests((meet & active).count_ones());
-                    let [a, b, c] = &block.vertices;
-                    let triangle = [
-                        vec3x::broadcast(token, a, lane),
-                        vec3x::broadcast(token, b, lane),
-                        vec3x::broadcast(token, c, lane),
-                    ];
-                    let crossing = sheared.cross(token, triangle);
-                    let bits = crossing.hit.bits() & meet & active;
-                    if bits == 0 || !counts(id, ignore) {
-                        continue;
-                    }
-                    crossing.det.store(&mut found.det);
-                    crossing.t.store(&mut found.t);
-                    crossing.u.store(&mut found.u);
-                    crossing.v.store(&mut found.v);
-                    active &= !visitor.hits(bits, id, &found, &mut t_max);
-                    if active == 0 {
-                        return;
-                    }
-                    if V::ORDERED {
-                        sheared.t_max = S::Packet::load(token, &t_max);
+            if V::ANY && meet.count_ones() <= ALONE {
+                ends.fill(slabs, &this.sheared);
+                let mut left = meet;
+                while left != 0 {
+                    let lane = left.trailing_zeros() as usize & 15;
+                    left &= left - 1;
+                    let t_max = this.t_max[lane];
+                    let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, lane, ends.t_min[lane]);
+                    let sheared = ends.sheared(token, axes, lane, t_max);
+                    if let Some(place) = self.blocker_of(next, &slabs, &sheared, t_max, ignore, counter) {
+                        this.active &= !visitor.hits(
+                            1 << lane,
+                            &self.blocks[place.block],
+                            place.lane,
+                            &this.found,
+                            &mut this.t_max,
+                        );
                     }
                 }
+            } else if next.is_leaf() {
+                self.meet_block(&self.blocks[next.index()], meet, &mut this, ignore, counter, visitor);
             } else {
                 let node = &self.nodes[next.index()];
-                counter.node_tests(node.len() * meet.count_ones());
-                let first = len;
-                let mut entry = [0.0; 16];
-                for place in 0..Node::WIDTH {
-                    let child = node.children[place];
-                    if child == Child::NONE {
-                        continue;
-                    }
-                    let (hit, enter) = slabs.meet(token, node, place, sheared.t_max);
-                    let meet = hit.bits() & meet;
-                    if meet == 0 {
-                        continue;
-                    }
-                    let mut slot = len;
-                    let mut at = 0.0;
+                self.meet_node::<V>(node, meet, slabs, &mut this, &mut stack, counter);
+            }
+            if this.active == 0 {
+                return;
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn meet_block<V: PacketVisitor<S::Packet>>(
+        &self,
+        block: &TriangleBlock,
+        meet: u32,
+        this: &mut Going<S::Packet>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        visitor: &mut V,
+    ) {
+        let token = self.simd.token();
+        let mut lane = 0;
+        while lane < TriangleBlock::WIDTH {
+            let id = block.ids[lane];
+            if id == crate::triangle::NO_TRIANGLE {
+                break;
+            }
+            counter.triangle_tests((meet & this.active).count_ones());
+            let [a, b, c] = &block.vertices;
+            let triangle = [
+                vec3x::broadcast(token, a, lane),
+                vec3x::broadcast(token, b, lane),
+                vec3x::broadcast(token, c, lane),
+            ];
+            let at = lane;
+            lane += 1;
+            let crossing = this.sheared.cross(token, triangle);
+            let bits = crossing.hit.bits() & meet & this.active;
+            if bits == 0 || !counts(id, ignore) {
+                continue;
+            }
+            crossing.det.store(&mut this.found.det);
+            crossing.t.store(&mut this.found.t);
+            crossing.u.store(&mut this.found.u);
+            crossing.v.store(&mut this.found.v);
+            this.active &= !visitor.hits(bits, block, at, &this.found, &mut this.t_max);
+            if this.active == 0 {
+                return;
+            }
+            if V::ORDERED {
+                this.sheared.t_max = S::Packet::load(token, &this.t_max);
+            }
+        }
+    }
+
+    #[inline(always)]
+    fn meet_node<V: PacketVisitor<S::Packet>>(
+        &self,
+        node: &Node,
+        meet: u32,
+        slabs: &PacketSlabs<S::Packet>,
+        this: &mut Going<S::Packet>,
+        stack: &mut ArrayVec<(Child, u32, f32), STACK>,
+        counter: &mut impl Counter,
+    ) {
+        let token = self.simd.token();
+        counter.node_tests(node.len() * meet.count_ones());
+        let first = stack.len();
+        let mut place = 0;
+        while place < Node::WIDTH {
+            let child = node.children[place];
+            if child != Child::NONE {
+                let (hit, enter) = slabs.meet(token, node, place, this.sheared.t_max);
+                let meet = hit.bits() & meet;
+                if meet != 0 {
+                    // Depth is checked at construction, so there is always room.
+                    stack.push((child, meet, 0.0));
                     if V::ORDERED {
-                        enter.store(&mut entry);
-                        at = entry[meet.trailing_zeros() as usize & 15];
+                        enter.store(&mut this.entry);
+                        let at = this.entry[meet.trailing_zeros() as usize & 15];
+                        let mut slot = stack.len() - 1;
                         while slot > first && stack[slot - 1].2 < at {
                             stack[slot] = stack[slot - 1];
                             slot -= 1;
                         }
+                        stack[slot] = (child, meet, at);
                     }
-                    stack[slot] = (child, meet, at);
-                    len += 1;
                 }
             }
+            place += 1;
         }
     }
+}
+
+/// A packet on its way through the tree.
+struct Going<L: Lanes> {
+    sheared: Sheared<L>,
+    t_max: [f32; 16],
+    found: Found,
+    /// Rays that want more.
+    active: u32,
+    entry: [f32; 16],
+}
+
+/// Where a traversal begins: at the root, or with some triangles and subtrees, as children of nodes made for it.
+pub(super) struct Start<'c> {
+    pub(super) root: bool,
+    pub(super) blocks: &'c [TriangleBlock],
+    pub(super) nodes: &'c [Node],
+    /// Subtrees, and which of all rays may meet them; the packet's are those from bit `shift` on.
+    pub(super) entries: &'c [(Child, f32, u64)],
+    pub(super) shift: usize,
+}
+
+impl Start<'_> {
+    /// At the root.
+    pub(super) const ROOT: Start<'static> = Start { root: true, blocks: &[], nodes: &[], entries: &[], shift: 0 };
 }

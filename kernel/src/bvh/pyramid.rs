@@ -18,13 +18,18 @@
 //!
 //! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by the same bound.
 
+use super::packet::{Any, Note, Rays, Start};
 use super::{Bvh, Child, Node, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::Ray;
 use crate::triangle::{Axes, Found, Sheared, TriangleBlock, shear_one};
 use crate::vec3x;
+use arrayvec::ArrayVec;
 use glam::Vec3;
+
+/// After as many nodes the rest goes on in packets.
+const HANDOVER: u32 = 4;
 
 /// Targets a pyramid takes.
 pub(super) const MOST: usize = 64;
@@ -45,10 +50,7 @@ const LEAF_LONE: u32 = 3;
 const CAUTION: f32 = 2.0;
 
 /// Subtrees yet to visit: how deep each begins, and the targets it may hide.
-pub(super) type Stack = [(Child, f32, u64); STACK];
-
-/// A stack of anything.
-pub(super) const NO_STACK: Stack = [(Child::NONE, 0.0, 0); STACK];
+pub(super) type Stack = ArrayVec<(Child, f32, u64), STACK>;
 
 /// Up to 64 targets as seen from x.
 pub(super) struct Pyramid {
@@ -87,16 +89,17 @@ pub(super) struct Pyramid {
 
 /// Positions with `normal . position + offset >= 0` may be in the pyramid.
 #[derive(Clone, Copy, Default)]
-struct Plane {
+pub(super) struct Plane {
     normal: Vec3,
     offset: f32,
     /// Which corner of a box reaches farthest inside, by axis: 0 the least, 1 the greatest.
-    side: [usize; 3],
+    pub(super) side: [usize; 3],
 }
 
 impl Plane {
+    /// With `normal . (p - x) + at >= 0` inside, and as much beyond as the slack says.
     #[inline(always)]
-    fn new(normal: Vec3, at: f32, x: Vec3, slack: f32) -> Self {
+    pub(super) fn new(normal: Vec3, at: f32, x: Vec3, slack: f32) -> Self {
         Self {
             normal,
             offset: at - normal.dot(x) + slack,
@@ -105,8 +108,22 @@ impl Plane {
     }
 }
 
+impl Plane {
+    /// How far inside positions are.
+    #[inline(always)]
+    pub(super) fn at<L: Lanes>(&self, token: L::Token, [x, y, z]: [L; 3]) -> L {
+        x.mul_add(
+            L::splat(token, self.normal.x),
+            y.mul_add(
+                L::splat(token, self.normal.y),
+                z.mul_add(L::splat(token, self.normal.z), L::splat(token, self.offset)),
+            ),
+        )
+    }
+}
+
 /// Eight triangles as forms, by lane.
-struct Forms {
+pub(super) struct Forms {
     /// The four forms' coefficients of s, t and 1.
     edges: [[[f32; 8]; 3]; 3],
     /// `|V|`: what the sum of the edges must reach at depth 1.
@@ -114,6 +131,11 @@ struct Forms {
     /// Above this a form is surely positive, below minus this surely negative.
     edge_bound: [f32; 8],
     depth_bound: [f32; 8],
+}
+
+impl Forms {
+    const NOTHING: Self =
+        Self { edges: [[[0.0; 8]; 3]; 3], volume: [0.0; 8], edge_bound: [0.0; 8], depth_bound: [0.0; 8] };
 }
 
 /// What the set-up says of the triangles of a block.
@@ -130,7 +152,7 @@ struct Verdict {
 
 /// The sum of absolute components.
 #[inline(always)]
-fn extent(v: Vec3) -> f32 {
+pub(super) fn extent(v: Vec3) -> f32 {
     let v = v.abs();
     v.x + v.y + v.z
 }
@@ -240,6 +262,12 @@ impl Pyramid {
         true
     }
 
+    /// One bit for each target.
+    #[inline(always)]
+    pub(super) fn every(&self) -> u64 {
+        u64::MAX >> (64 - self.count)
+    }
+
     pub(super) const EMPTY: Self = Self {
         x: Vec3::ZERO,
         rows: [Vec3::ZERO; 3],
@@ -287,13 +315,7 @@ impl Pyramid {
                 let x = bounds[plane.side[0] & 1][0];
                 let y = bounds[plane.side[1] & 1][1];
                 let z = bounds[plane.side[2] & 1][2];
-                reach = x.mul_add(
-                    N::<S>::splat(token, plane.normal.x),
-                    y.mul_add(
-                        N::<S>::splat(token, plane.normal.y),
-                        z.mul_add(N::<S>::splat(token, plane.normal.z), N::<S>::splat(token, plane.offset)),
-                    ),
-                );
+                reach = plane.at::<N<S>>(token, [x, y, z]);
                 inside = inside & zero.le(reach);
                 k += 1;
             }
@@ -712,7 +734,7 @@ fn dot<S: Simd>(token: S::Token, row: Vec3, d: [S::Packet; 3]) -> S::Packet {
 }
 
 #[inline(always)]
-fn least_of<L: Lanes>(v: L) -> f32 {
+pub(super) fn least_of<L: Lanes>(v: L) -> f32 {
     let mut lanes = [f32::INFINITY; 16];
     v.store(&mut lanes);
     let mut least = lanes[0];
@@ -725,7 +747,7 @@ fn least_of<L: Lanes>(v: L) -> f32 {
 }
 
 #[inline(always)]
-fn greatest_of<L: Lanes>(v: L) -> f32 {
+pub(super) fn greatest_of<L: Lanes>(v: L) -> f32 {
     -least_of(-v)
 }
 
@@ -739,28 +761,38 @@ impl<S: Simd> Bvh<'_, S> {
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
+        let every = pyramid.every();
+        counter.rays(pyramid.count as u32);
+        stack.clear();
+        stack.push((Child::node(0), 0.0, every));
+        let mut going = Going::new(every);
+        self.pyramid_goes_on(pyramid, stack, &mut going, ignore, counter, &mut Forgetful);
+        self.packets_go_on(pyramid, stack, &mut going, ignore, counter, &mut Forgetful);
+        every & !going.free
+    }
+
+    /// Takes the targets that the subtrees of the stack block from those that are free. Where there is too much of
+    /// it, the rest is left on the stack.
+    #[inline(always)]
+    pub(super) fn pyramid_goes_on(
+        &self,
+        pyramid: &mut Pyramid,
+        stack: &mut Stack,
+        going: &mut Going,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        learner: &mut impl Learner,
+    ) {
         let simd = self.simd;
         let token = simd.token();
-        let every = u64::MAX >> (64 - pyramid.count);
-        let mut free = every;
-        counter.rays(pyramid.count as u32);
-        let mut forms = Forms {
-            edges: [[[0.0; 8]; 3]; 3],
-            volume: [0.0; 8],
-            edge_bound: [0.0; 8],
-            depth_bound: [0.0; 8],
-        };
         let mut found = Found::NOTHING;
-        let mut len = 0;
-        let (mut visits, mut sorted) = (0, false);
-        let (mut next, mut may) = (Child::node(0), every);
-        let mut depth = [0.0; 8];
-        let mut hides = [every; 8];
-        loop {
-            let ask = may & free;
+        while going.visits < HANDOVER {
+            let Some((next, _, may)) = stack.pop() else { return };
+            let ask = may & going.free;
             if ask == 0 {
-                // Nothing left that this part could hide.
-            } else if next.is_leaf() {
+                continue;
+            }
+            if next.is_leaf() {
                 let block = &self.blocks[next.index()];
                 if ask.count_ones() <= LEAF_LONE {
                     let mut rest = ask;
@@ -774,68 +806,126 @@ impl<S: Simd> Bvh<'_, S> {
                             let lane = hits.trailing_zeros() as usize & 7;
                             hits &= hits - 1;
                             if super::counts(block.ids[lane], ignore) {
-                                free &= !(1 << i);
+                                going.free &= !(1 << i);
                             }
                         }
                     }
                 } else {
-                    free &= !self.block_blocked(pyramid, block, &mut forms, ask, ignore, counter);
+                    let blocked = self.block_blocked(
+                        pyramid,
+                        block,
+                        &mut going.forms,
+                        ask,
+                        ignore,
+                        counter,
+                        learner,
+                    );
+                    going.free &= !blocked;
                 }
-                if free == 0 {
-                    return every;
-                }
-            } else if ask.count_ones() <= LONE && visits > EASY {
+            } else if ask.count_ones() <= LONE && going.visits > EASY {
                 let mut rest = ask;
                 while rest != 0 {
                     let i = rest.trailing_zeros() as usize;
                     rest &= rest - 1;
-                    if self.occluded_below(next, &pyramid.ray(i), pyramid.axis(i), ignore, counter) {
-                        free &= !(1 << i);
+                    let (ray, axis) = (pyramid.ray(i), pyramid.axis(i));
+                    if self.blocker_below(next, &ray, axis, ignore, counter).is_some() {
+                        going.free &= !(1 << i);
                     }
-                }
-                if free == 0 {
-                    return every;
                 }
             } else {
-                let node = &self.nodes[next.index()];
-                counter.node_tests(node.len());
-                let mut met = pyramid.children(simd, node, &mut depth);
-                if visits >= EASY && met != 0 {
-                    if !sorted {
-                        pyramid.sort();
-                        sorted = true;
-                    }
-                    pyramid.hidden(simd, node, met, &mut hides);
-                }
-                visits += u32::from(visits <= EASY);
-                let first = len;
-                while met != 0 {
-                    let place = met.trailing_zeros() as usize & 7;
-                    met &= met - 1;
-                    let (child, at, may) = (node.children[place], depth[place], hides[place] & ask);
-                    if may == 0 || child == Child::NONE {
-                        continue;
-                    }
-                    let mut slot = len;
-                    while slot > first && stack[slot - 1].1 < at {
-                        stack[slot] = stack[slot - 1];
-                        slot -= 1;
-                    }
-                    stack[slot] = (child, at, may);
-                    len += 1;
-                }
+                self.push_children(pyramid, &self.nodes[next.index()], ask, stack, going, counter);
             }
-            if len == 0 {
-                return every & !free;
+            if going.free == 0 {
+                return;
             }
-            len -= 1;
-            (next, _, may) = stack[len];
+        }
+    }
+
+    /// The same with the rest of the stack, in packets.
+    #[inline(always)]
+    pub(super) fn packets_go_on(
+        &self,
+        pyramid: &Pyramid,
+        stack: &Stack,
+        going: &mut Going,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        learner: &mut impl Learner,
+    ) {
+        if stack.is_empty() || going.free == 0 {
+            return;
+        }
+        let token = self.simd.token();
+        let mut shift = 0;
+        while shift < pyramid.count {
+            let ask = (going.free >> shift) as u32 & ((1 << S::Packet::WIDTH) - 1);
+            if ask != 0 {
+                let rays = Rays {
+                    origin: vec3x::splat(token, pyramid.x.to_array()),
+                    direction: [
+                        S::Packet::load(token, &pyramid.direction[0][shift..]),
+                        S::Packet::load(token, &pyramid.direction[1][shift..]),
+                        S::Packet::load(token, &pyramid.direction[2][shift..]),
+                    ],
+                    t_min: S::Packet::splat(token, 0.0),
+                    t_max: S::Packet::splat(token, 1.0),
+                };
+                let start = Start { root: false, blocks: &[], nodes: &[], entries: stack, shift };
+                let mut any = Any { blocked: 0, note: Learn(learner) };
+                self.traverse_rays(&start, &rays, ask, ignore, counter, &mut any);
+                going.free &= !(u64::from(any.blocked) << shift);
+            }
+            shift += S::Packet::WIDTH;
+        }
+    }
+
+    /// Puts the children of a node that may block any of `ask` on the stack, the nearest on top.
+    #[inline(always)]
+    pub(super) fn push_children(
+        &self,
+        pyramid: &mut Pyramid,
+        node: &Node,
+        ask: u64,
+        stack: &mut Stack,
+        going: &mut Going,
+        counter: &mut impl Counter,
+    ) {
+        let simd = self.simd;
+        let mut depth = [0.0; 8];
+        let mut hides = [u64::MAX; 8];
+        counter.node_tests(node.len());
+        let mut met = pyramid.children(simd, node, &mut depth);
+        if going.visits >= EASY && met != 0 {
+            if !going.sorted {
+                pyramid.sort();
+                going.sorted = true;
+            }
+            pyramid.hidden(simd, node, met, &mut hides);
+        }
+        going.visits += 1;
+        let first = stack.len();
+        while met != 0 {
+            let place = met.trailing_zeros() as usize & 7;
+            met &= met - 1;
+            let (child, at, may) = (node.children[place], depth[place], hides[place] & ask);
+            if may == 0 || child == Child::NONE {
+                continue;
+            }
+            // Depth is checked at construction, so there is always room.
+            let mut slot = stack.len();
+            stack.push((child, at, may));
+            while slot > first && stack[slot - 1].1 < at {
+                stack[slot] = stack[slot - 1];
+                slot -= 1;
+            }
+            stack[slot] = (child, at, may);
         }
     }
 
     /// Which targets of `ask` the triangles of a block hide.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    fn block_blocked(
+    pub(super) fn block_blocked(
         &self,
         pyramid: &Pyramid,
         block: &TriangleBlock,
@@ -843,6 +933,7 @@ impl<S: Simd> Bvh<'_, S> {
         ask: u64,
         ignore: Option<u32>,
         counter: &mut impl Counter,
+        learner: &mut impl Learner,
     ) -> u64 {
         let simd = self.simd;
         let verdict = pyramid.set_up(simd, block, forms);
@@ -857,8 +948,10 @@ impl<S: Simd> Bvh<'_, S> {
             }
             if verdict.all >> lane & 1 != 0 {
                 counter.triangle_tests(1);
+                learner.learn(block, lane, ask.count_ones());
                 return u64::MAX;
             }
+            let before = blocked;
             let ask = ask & !blocked;
             counter.triangle_tests(ask.count_ones());
             if verdict.unclear >> lane & 1 != 0 {
@@ -874,10 +967,53 @@ impl<S: Simd> Bvh<'_, S> {
                 let deep = verdict.deep >> lane & 1 != 0;
                 blocked |= pyramid.test(simd, forms, block, lane, deep, ask);
             }
+            if blocked != before {
+                learner.learn(block, lane, (blocked & !before).count_ones());
+            }
             if ask & !blocked == 0 {
                 break;
             }
         }
         blocked
     }
+}
+
+/// How far a query has come.
+pub(super) struct Going {
+    pub(super) forms: Forms,
+    /// Targets that nothing blocks so far.
+    pub(super) free: u64,
+    /// Nodes visited, counted up to where that matters.
+    visits: u32,
+    sorted: bool,
+}
+
+impl Going {
+    #[inline(always)]
+    pub(super) fn new(free: u64) -> Self {
+        Self { forms: Forms::NOTHING, free, visits: 0, sorted: false }
+    }
+}
+
+/// Hears of triangles that blocked something.
+pub(super) trait Learner {
+    fn learn(&mut self, block: &TriangleBlock, lane: usize, blocked: u32);
+}
+
+/// Passes on what packets hit.
+pub(super) struct Learn<'l, L>(pub(super) &'l mut L);
+
+impl<L: Learner> Note for Learn<'_, L> {
+    #[inline(always)]
+    fn note(&mut self, bits: u32, block: &TriangleBlock, lane: usize) {
+        self.0.learn(block, lane, bits.count_ones());
+    }
+}
+
+/// Does not care.
+pub(super) struct Forgetful;
+
+impl Learner for Forgetful {
+    #[inline(always)]
+    fn learn(&mut self, _: &TriangleBlock, _: usize, _: u32) {}
 }

@@ -1,12 +1,20 @@
 //! One ray at a time: eight boxes or eight triangles a step.
 
 use super::slabs::{SHORTEST, Slabs};
-use super::{Bvh, Child, Node, STACK, counts};
+use super::{Bvh, Child, MAX_DEPTH, Node, STACK, counts};
 use crate::counter::Counter;
 use crate::lanes::Simd;
 use crate::ray::{Hit, Ray};
-use crate::triangle::{Found, dominant_axis, shear_one};
+use crate::triangle::{Found, Sheared, dominant_axis, shear_one};
+use arrayvec::ArrayVec;
 use core::ops::ControlFlow;
+
+/// A triangle by where it is kept.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Place {
+    pub(super) block: usize,
+    pub(super) lane: usize,
+}
 
 /// What becomes of the hits of a block.
 trait Visitor {
@@ -203,19 +211,33 @@ impl<S: Simd> Bvh<'_, S> {
         self.traverse_below(Child::node(0), ray, axis, ignore, counter, visitor);
     }
 
-    /// Does anything but `ignore` in this subtree block a ray that can hit something?
+    /// Which triangle but `ignore` in this subtree blocks a ray that can hit something, if any does?
     #[inline(always)]
-    pub(super) fn occluded_below(
+    pub(super) fn blocker_below(
         &self,
         subtree: Child,
         ray: &Ray,
         axis: usize,
         ignore: Option<u32>,
         counter: &mut impl Counter,
-    ) -> bool {
-        let mut visitor = First { t_max: ray.t_max, found: None };
-        self.traverse_below(subtree, ray, axis, ignore, counter, &mut visitor);
-        visitor.found.is_some()
+    ) -> Option<Place> {
+        let slabs = Slabs::<S::Node>::new(self.simd.token(), ray, self.slack(ray.origin));
+        let sheared = shear_one(self.simd, ray, axis);
+        self.blocker_of(subtree, &slabs, &sheared, ray.t_max, ignore, counter)
+    }
+
+    /// The same for a ray made ready.
+    #[inline(always)]
+    pub(super) fn blocker_of(
+        &self,
+        subtree: Child,
+        slabs: &Slabs<S::Node>,
+        sheared: &Sheared<S::Node>,
+        t_max: f32,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> Option<Place> {
+        self.traverse_in_no_order(subtree, slabs, sheared, ignore, counter, &mut First { t_max, found: None })
     }
 
     #[inline(always)]
@@ -228,14 +250,87 @@ impl<S: Simd> Bvh<'_, S> {
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
+        if V::ORDERED {
+            self.traverse_in_order(subtree, ray, axis, ignore, counter, visitor);
+        } else {
+            let slabs = Slabs::<S::Node>::new(self.simd.token(), ray, self.slack(ray.origin));
+            let sheared = shear_one(self.simd, ray, axis);
+            self.traverse_in_no_order(subtree, &slabs, &sheared, ignore, counter, visitor);
+        }
+    }
+
+    /// Gives where the visitor broke off. What is left to visit is a node and a bit for each of its children, level
+    /// by level: nothing is copied for children that are never come to.
+    #[inline(always)]
+    fn traverse_in_no_order<V: Visitor>(
+        &self,
+        subtree: Child,
+        slabs: &Slabs<S::Node>,
+        sheared: &Sheared<S::Node>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        visitor: &mut V,
+    ) -> Option<Place> {
+        let token = self.simd.token();
+        let mut levels = [(0u32, 0u32); MAX_DEPTH];
+        let mut level = 0;
+        let mut next = subtree;
+        let mut entry = [0.0; 8];
+        let mut found = Found::NOTHING;
+        loop {
+            if next.is_leaf() {
+                let block = &self.blocks[next.index()];
+                counter.triangle_tests(block.len() as u32);
+                let mut hits = sheared.cross_block(token, block, &mut found);
+                while hits != 0 {
+                    let lane = hits.trailing_zeros() as usize & 7;
+                    hits &= hits - 1;
+                    let id = block.ids[lane];
+                    if counts(id, ignore) && visitor.hit(id, || found.hit(lane, id)).is_break() {
+                        return Some(Place { block: next.index(), lane });
+                    }
+                }
+            } else {
+                let node = &self.nodes[next.index()];
+                counter.node_tests(node.len());
+                // Depth is checked at construction, so there is always room.
+                levels[level] = (next.index() as u32, slabs.children(token, node, visitor.t_max(), &mut entry));
+                level += 1;
+            }
+            next = loop {
+                if level == 0 {
+                    return None;
+                }
+                let (node, left) = levels[level - 1];
+                if left == 0 {
+                    level -= 1;
+                    continue;
+                }
+                levels[level - 1].1 = left & (left - 1);
+                let child = self.nodes[node as usize].children[left.trailing_zeros() as usize & 7];
+                // Its box is empty, or was never looked at: nothing promises that no ray meets it.
+                if child != Child::NONE {
+                    break child;
+                }
+            };
+        }
+    }
+
+    /// Nearest first, and no farther than what was found.
+    #[inline(always)]
+    fn traverse_in_order<V: Visitor>(
+        &self,
+        subtree: Child,
+        ray: &Ray,
+        axis: usize,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        visitor: &mut V,
+    ) {
         let token = self.simd.token();
         let slabs = Slabs::<S::Node>::new(token, ray, self.slack(ray.origin));
         let sheared = shear_one(self.simd, ray, axis);
-
-        // Apart, so that each is cleared in one go and the distances not at all where order does not matter.
-        let mut stack = [Child::NONE; STACK];
-        let mut entries = [0.0f32; STACK];
-        let mut len = 0;
+        let mut stack = ArrayVec::<(Child, f32), STACK>::new();
         let mut next = subtree;
         let mut entry = [0.0; 8];
         let mut found = Found::NOTHING;
@@ -256,39 +351,31 @@ impl<S: Simd> Bvh<'_, S> {
                 let node = &self.nodes[next.index()];
                 counter.node_tests(node.len());
                 let mut met = slabs.children(token, node, visitor.t_max(), &mut entry);
-                let first = len;
+                let first = stack.len();
                 while met != 0 {
                     let place = met.trailing_zeros() as usize & 7;
                     met &= met - 1;
                     let (child, at) = (node.children[place], entry[place]);
-                    // Its box is empty, or was never looked at: nothing promises that no ray meets it.
                     if child == Child::NONE {
                         continue;
                     }
-                    let mut slot = len;
-                    if V::ORDERED {
-                        // Farthest first, so that the nearest is on top.
-                        while slot > first && entries[slot - 1] < at {
-                            (stack[slot], entries[slot]) = (stack[slot - 1], entries[slot - 1]);
-                            slot -= 1;
-                        }
-                        entries[slot] = at;
+                    // Farthest first, so that the nearest is on top. Depth is checked at construction, so there
+                    // is always room.
+                    let mut slot = stack.len();
+                    stack.push((child, at));
+                    while slot > first && stack[slot - 1].1 < at {
+                        stack[slot] = stack[slot - 1];
+                        slot -= 1;
                     }
-                    // Depth is checked at construction, so there is always room.
-                    stack[slot] = child;
-                    len += 1;
+                    stack[slot] = (child, at);
                 }
             }
             loop {
-                if len == 0 {
-                    return;
+                let Some((child, at)) = stack.pop() else { return };
+                if at <= visitor.t_max() {
+                    next = child;
+                    break;
                 }
-                len -= 1;
-                if V::ORDERED && entries[len] > visitor.t_max() {
-                    continue;
-                }
-                next = stack[len];
-                break;
             }
         }
     }

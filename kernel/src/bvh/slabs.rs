@@ -75,6 +75,23 @@ impl<L: Lanes> Slabs<L> {
         }
     }
 
+    /// One ray of a packet, from what [`PacketSlabs::store`] wrote.
+    #[inline(always)]
+    pub(super) fn of_lane(token: L::Token, from: &[[[f32; 16]; 3]; 3], lane: usize, t_min: f32) -> Self {
+        let [inverse, near, far] = from;
+        Self {
+            inverse: vec3x::broadcast(token, inverse, lane),
+            near: vec3x::broadcast(token, near, lane),
+            far: vec3x::broadcast(token, far, lane),
+            near_side: [
+                usize::from(inverse[0][lane] < 0.0),
+                usize::from(inverse[1][lane] < 0.0),
+                usize::from(inverse[2][lane] < 0.0),
+            ],
+            t_min: L::splat(token, t_min),
+        }
+    }
+
     /// Where the ray crosses the near or the far planes of an axis.
     #[inline(always)]
     fn planes(&self, token: L::Token, node: &Node, from: usize, axis: usize, far: usize) -> L {
@@ -117,17 +134,38 @@ pub(super) struct PacketSlabs<L> {
     near: Vec3x<L>,
     far: Vec3x<L>,
     t_min: L,
+    /// Which side is near, by axis, if that is the same for all rays: a multiply-add a plane then does.
+    near_side: Option<[usize; 3]>,
 }
 
 impl<L: Lanes> PacketSlabs<L> {
     #[inline(always)]
-    pub(super) fn new(token: L::Token, origin: Vec3x<L>, direction: Vec3x<L>, t_min: L, slack: L) -> Self {
+    pub(super) fn new(
+        token: L::Token,
+        active: u32,
+        origin: Vec3x<L>,
+        direction: Vec3x<L>,
+        t_min: L,
+        slack: L,
+    ) -> Self {
         let length = vec3x::abs(direction);
         let least = vec3x::most(length) * L::splat(token, FLATTEST);
         let x = Self::axis(token, origin[0], direction[0], length[0], least, slack);
         let y = Self::axis(token, origin[1], direction[1], length[1], least, slack);
         let z = Self::axis(token, origin[2], direction[2], length[2], least, slack);
-        Self { inverse: [x.0, y.0, z.0], near: [x.1, y.1, z.1], far: [x.2, y.2, z.2], t_min }
+        let inverse = [x.0, y.0, z.0];
+        let zero = L::splat(token, 0.0);
+        let [falls_x, falls_y, falls_z] = [
+            inverse[0].lt(zero).bits() & active,
+            inverse[1].lt(zero).bits() & active,
+            inverse[2].lt(zero).bits() & active,
+        ];
+        let alike = (falls_x == 0 || falls_x == active)
+            && (falls_y == 0 || falls_y == active)
+            && (falls_z == 0 || falls_z == active);
+        let sides = [usize::from(falls_x != 0), usize::from(falls_y != 0), usize::from(falls_z != 0)];
+        let near_side = if alike { Some(sides) } else { None };
+        Self { inverse, near: [x.1, y.1, z.1], far: [x.2, y.2, z.2], t_min, near_side }
     }
 
     /// The inverse, and the constants of near and far planes, of one axis.
@@ -146,15 +184,44 @@ impl<L: Lanes> PacketSlabs<L> {
         )
     }
 
+    /// Writes the constants of each ray: inverse, near and far by axis.
+    #[inline(always)]
+    pub(super) fn store(&self, to: &mut [[[f32; 16]; 3]; 3]) {
+        let mut axis = 0;
+        while axis < 3 {
+            self.inverse[axis].store(&mut to[0][axis]);
+            self.near[axis].store(&mut to[1][axis]);
+            self.far[axis].store(&mut to[2][axis]);
+            axis += 1;
+        }
+    }
+
     /// Which rays may meet a box up to `t_max`, and from which `t` on.
     #[inline(always)]
     pub(super) fn meet(&self, token: L::Token, node: &Node, place: usize, t_max: L) -> (L::Mask, L) {
-        let x = self.slab(token, node, place, 0);
-        let y = self.slab(token, node, place, 1);
-        let z = self.slab(token, node, place, 2);
+        let (x, y, z);
+        if let Some(near_side) = self.near_side {
+            x = self.planes(token, node, place, 0, near_side[0]);
+            y = self.planes(token, node, place, 1, near_side[1]);
+            z = self.planes(token, node, place, 2, near_side[2]);
+        } else {
+            x = self.slab(token, node, place, 0);
+            y = self.slab(token, node, place, 1);
+            z = self.slab(token, node, place, 2);
+        }
         let enter = x.0.max(y.0).max(z.0.max(self.t_min));
         let leave = x.1.min(y.1).min(z.1.min(t_max));
         (enter.le(leave), enter)
+    }
+
+    #[inline(always)]
+    fn planes(&self, token: L::Token, node: &Node, place: usize, axis: usize, near_side: usize) -> (L, L) {
+        let near = L::splat(token, node.bounds[near_side & 1][axis][place]);
+        let far = L::splat(token, node.bounds[near_side & 1 ^ 1][axis][place]);
+        (
+            near.mul_add(self.inverse[axis], self.near[axis]),
+            far.mul_add(self.inverse[axis], self.far[axis]),
+        )
     }
 
     #[inline(always)]

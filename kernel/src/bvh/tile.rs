@@ -1,0 +1,613 @@
+//! Neighbouring points and one light: what all their segments have in common is asked once.
+//!
+//! A shaft around the points and the targets goes down the tree first. Often it comes back empty, and every target
+//! is visible. Else it yields the few triangles there are, side by side in blocks of their own, or, where they are
+//! many, the subtrees to begin with. Each point then starts from these and not from the root; and the triangles
+//! that blocked anything for one point are asked first for the next.
+
+use super::batch::{BatchScratch, FEW};
+use super::packet::{Any, Nobody, Rays, Start};
+use super::pyramid::{Forgetful, Going, Learner, MOST};
+use super::shaft::{Around, Shaft};
+use super::{Bvh, CUT, Child, Node, Targets};
+use crate::counter::Counter;
+use crate::lanes::{Lanes, Simd};
+use crate::triangle::{NO_TRIANGLE, TriangleBlock};
+use crate::vec3x;
+use glam::Vec3;
+
+/// A point of a tile, and which of the targets it asks about.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct TilePoint {
+    /// Where its segments begin.
+    pub x: [f32; 3],
+    /// The first of its targets.
+    pub first: u32,
+    /// How many targets it has, one after the other.
+    pub count: u32,
+}
+
+/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About twenty kilobytes.
+pub struct TileScratch {
+    batch: BatchScratch,
+    cut: Cut,
+    given: List,
+    learned: List,
+    packet: Packet,
+}
+
+impl TileScratch {
+    /// Ready for any query.
+    pub const fn new() -> Self {
+        Self {
+            batch: BatchScratch::new(),
+            cut: Cut::NOTHING,
+            given: List::EMPTY,
+            learned: List::EMPTY,
+            packet: Packet::EMPTY,
+        }
+    }
+}
+
+impl Default for TileScratch {
+    fn default() -> Self {
+        Self::new()
+    }
+}
+
+impl core::fmt::Debug for TileScratch {
+    fn fmt(&self, f: &mut core::fmt::Formatter<'_>) -> core::fmt::Result {
+        f.write_str("TileScratch")
+    }
+}
+
+/// Subtrees that a shaft meets.
+struct Cut {
+    /// As children of nodes that are in no tree.
+    nodes: [Node; CUT / Node::WIDTH],
+    count: usize,
+    /// Yet to look into, while the shaft goes down.
+    queue: [Entry; QUEUE],
+}
+
+/// A subtree and its box.
+#[derive(Clone, Copy)]
+struct Entry {
+    child: Child,
+    bounds: [[f32; 3]; 2],
+}
+
+/// Subtrees a shaft keeps track of.
+const QUEUE: usize = 128;
+
+impl Cut {
+    const NOTHING: Self = Self {
+        nodes: [Node::EMPTY; CUT / Node::WIDTH],
+        count: 0,
+        queue: [Entry { child: Child::NONE, bounds: [[0.0; 3]; 2] }; QUEUE],
+    };
+
+    /// The nodes in use.
+    #[inline(always)]
+    fn nodes(&self) -> &[Node] {
+        &self.nodes[..self.count.div_ceil(Node::WIDTH)]
+    }
+
+    /// Adds a subtree. There must be room.
+    #[inline(always)]
+    fn push(&mut self, entry: &Entry) {
+        let (node, place) = (self.count / Node::WIDTH, self.count % Node::WIDTH);
+        if place == 0 {
+            self.nodes[node] = Node::EMPTY;
+        }
+        self.nodes[node].set(place, entry.bounds[0], entry.bounds[1], entry.child);
+        self.count += 1;
+    }
+}
+
+/// Triangles to ask first.
+struct List {
+    blocks: [TriangleBlock; List::MOST / TriangleBlock::WIDTH],
+    /// How much more a block blocks than it must to be worth asking.
+    scores: [f32; List::MOST / TriangleBlock::WIDTH],
+    count: usize,
+    /// Blocks that may yet prove not worth asking before no more triangles are learned.
+    credit: u32,
+}
+
+impl List {
+    const MOST: usize = 128;
+
+    const EMPTY: Self = Self {
+        blocks: [TriangleBlock::EMPTY; List::MOST / TriangleBlock::WIDTH],
+        scores: [0.0; List::MOST / TriangleBlock::WIDTH],
+        count: 0,
+        credit: 0,
+    };
+
+    /// The blocks in use.
+    #[inline(always)]
+    fn blocks(&self) -> &[TriangleBlock] {
+        &self.blocks[..self.count.div_ceil(TriangleBlock::WIDTH)]
+    }
+
+    /// Copies a triangle to the end. There must be room.
+    #[inline(always)]
+    fn push(&mut self, from: &TriangleBlock, lane: usize) {
+        let (block, place) = (self.count / TriangleBlock::WIDTH, self.count % TriangleBlock::WIDTH);
+        if place == 0 {
+            self.blocks[block] = TriangleBlock::EMPTY;
+            self.scores[block] = WORTH;
+        }
+        let to = &mut self.blocks[block];
+        let mut vertex = 0;
+        while vertex < 3 {
+            let mut axis = 0;
+            while axis < 3 {
+                to.vertices[vertex][axis][place] = from.vertices[vertex][axis][lane];
+                axis += 1;
+            }
+            vertex += 1;
+        }
+        to.ids[place] = from.ids[lane];
+        self.count += 1;
+    }
+}
+
+impl List {
+    /// Notes that the list did not do for a point. It is given up when that comes too often.
+    #[inline(always)]
+    fn fail(&mut self) {
+        self.credit = self.credit.saturating_sub(1);
+        if self.credit == 0 {
+            self.count = 0;
+        }
+    }
+
+    /// Notes how many targets a block blocked, moves it up if it does better than the one before it, and drops it if
+    /// it does too little and may go. False if another now stands in its place.
+    #[inline(always)]
+    fn judge(&mut self, k: usize, blocked: u32, may_go: bool) -> bool {
+        let score = self.scores[k] * FADING + blocked as f32 - WORTH;
+        self.scores[k] = score;
+        // The last block may have room; it stays the last.
+        if (k + 1) * TriangleBlock::WIDTH > self.count {
+            return true;
+        }
+        if may_go && score < LEAST_SCORE {
+            // The last full one takes its place, and the one with room, if any, that one's.
+            let full = self.count / TriangleBlock::WIDTH - 1;
+            (self.blocks[k], self.scores[k]) = (self.blocks[full], self.scores[full]);
+            if self.count % TriangleBlock::WIDTH != 0 {
+                (self.blocks[full], self.scores[full]) = (self.blocks[full + 1], self.scores[full + 1]);
+            }
+            self.count -= TriangleBlock::WIDTH;
+            self.credit = self.credit.saturating_sub(1);
+            return false;
+        }
+        if k > 0 && score > self.scores[k - 1] {
+            self.blocks.swap(k, k - 1);
+            self.scores.swap(k, k - 1);
+        }
+        true
+    }
+}
+
+/// A learned block that blocks fewer targets a point than this, by and by, is dropped: looking for them in the tree
+/// is then cheaper than asking it every time.
+const WORTH: f32 = 3.0;
+const FADING: f32 = 0.75;
+
+/// A triangle that blocks as many targets at once is learned.
+const LEARN: u32 = 1;
+const CREDIT: u32 = 4;
+const LEAST_SCORE: f32 = -4.0;
+
+impl Learner for List {
+    #[inline(always)]
+    fn learn(&mut self, block: &TriangleBlock, lane: usize, blocked: u32) {
+        if blocked >= LEARN && self.count < Self::MOST && self.credit > 0 {
+            self.push(block, lane);
+        }
+    }
+}
+
+/// Rays of several points, side by side.
+struct Packet {
+    origin: [[f32; 16]; 3],
+    direction: [[f32; 16]; 3],
+    target: [u32; 16],
+    count: usize,
+}
+
+impl Packet {
+    const EMPTY: Self =
+        Self { origin: [[0.0; 16]; 3], direction: [[0.0; 16]; 3], target: [0; 16], count: 0 };
+}
+
+/// Steps a shaft may take for each ray of its tile, and at most.
+const STEPS: [usize; 3] = [16, 8, 192];
+
+impl<S: Simd> Bvh<'_, S> {
+    /// Which of the segments from each point to its targets does anything but `ignore` block?
+    ///
+    /// Bit `i % 64` of `blocked[i / 64]` answers for target `i`, as [`Bvh::occluded`] would for
+    /// [`Ray::segment(x, target)`](crate::Ray::segment) with the point it belongs to; the bits of targets that
+    /// belong to no point are left alone. Panics if a point names targets that do not exist, or if `blocked` is
+    /// too short.
+    ///
+    /// Any points and any targets get right answers. It pays where the points are neighbours, such as those of 8
+    /// by 8 pixels, and the targets lie on one light.
+    #[inline(always)]
+    pub fn occluded_tile(
+        &self,
+        points: &[TilePoint],
+        targets: &Targets<'_>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        scratch: &mut TileScratch,
+        blocked: &mut [u64],
+    ) {
+        let mut rays = 0;
+        let mut k = 0;
+        while k < points.len() {
+            clear(blocked, points[k].first as usize, points[k].count as usize);
+            rays += points[k].count as usize;
+            k += 1;
+        }
+        if rays == 0 || self.nodes.is_empty() {
+            counter.rays(rays as u32);
+            return;
+        }
+        let shaft = self.shaft(points, targets);
+        let TileScratch { batch, cut, given, learned, packet } = scratch;
+        (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
+        let complete = match &shaft {
+            Some(shaft) => self.gather(shaft, rays, points.len(), cut, given, counter),
+            None => {
+                self.whole(cut);
+                false
+            }
+        };
+        if complete && given.count == 0 {
+            counter.rays(rays as u32);
+            return;
+        }
+        packet.count = 0;
+        let mut k = 0;
+        while k < points.len() {
+            let TilePoint { x, first, count } = points[k];
+            let (mut from, end) = (first as usize, (first + count) as usize);
+            while from < end {
+                let part = (end - from).min(MOST);
+                if part < FEW {
+                    let mut i = from;
+                    while i < from + part {
+                        packet.put(x, targets.get(i), i);
+                        if packet.count == S::Packet::WIDTH {
+                            self.send(packet, cut, given, ignore, counter, blocked);
+                        }
+                        i += 1;
+                    }
+                } else if complete {
+                    let word = if batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude) {
+                        counter.rays(part as u32);
+                        let every = batch.pyramid.every();
+                        every & !self.list_leaves(batch, given, false, ignore, counter)
+                    } else {
+                        self.packets_from_root(x, targets, from, part, ignore, counter)
+                    };
+                    set(blocked, from, word);
+                } else {
+                    let mut ask = u64::MAX >> (64 - part);
+                    let mut word = 0;
+                    if learned.count > 0
+                        && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude)
+                    {
+                        let left = self.list_leaves(batch, learned, true, ignore, counter);
+                        (word, ask) = (ask & !left, left);
+                        counter.rays(word.count_ones());
+                        if left.count_ones() * 4 > part as u32 {
+                            learned.fail();
+                        }
+                    }
+                    if ask != 0 {
+                        let start =
+                            Start { root: false, blocks: &[], nodes: cut.nodes(), entries: &[], shift: 0 };
+                        word |= self.packets_blocked(
+                            &start, x, targets, from, part, ask, ignore, counter, learned,
+                        );
+                    }
+                    set(blocked, from, word);
+                }
+                from += part;
+            }
+            k += 1;
+        }
+        if packet.count > 0 {
+            self.send(packet, cut, given, ignore, counter, blocked);
+        }
+    }
+
+    /// Which of the pyramid's targets the triangles of a list leave free.
+    #[inline(always)]
+    fn list_leaves(
+        &self,
+        batch: &mut BatchScratch,
+        list: &mut List,
+        may_go: bool,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> u64 {
+        let pyramid = &batch.pyramid;
+        let mut going = Going::new(pyramid.every());
+        let mut k = 0;
+        while k * TriangleBlock::WIDTH < list.count && going.free != 0 {
+            let ask = going.free;
+            let block = &list.blocks[k];
+            let hidden =
+                self.block_blocked(pyramid, block, &mut going.forms, ask, ignore, counter, &mut Forgetful);
+            going.free &= !hidden;
+            k += usize::from(list.judge(k, (ask & hidden).count_ones(), may_go));
+        }
+        going.free
+    }
+
+    /// The rays of a packet.
+    #[inline(always)]
+    fn send(
+        &self,
+        packet: &mut Packet,
+        cut: &Cut,
+        list: &List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        blocked: &mut [u64],
+    ) {
+        let token = self.simd.token();
+        let rays = Rays {
+            origin: vec3x::load(token, &packet.origin, 0),
+            direction: vec3x::load(token, &packet.direction, 0),
+            t_min: S::Packet::splat(token, 0.0),
+            t_max: S::Packet::splat(token, 1.0),
+        };
+        let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[], shift: 0 };
+        let mut any = Any { blocked: 0, note: Nobody };
+        self.traverse_rays(&start, &rays, (1 << packet.count) - 1, ignore, counter, &mut any);
+        let mut bits = any.blocked;
+        while bits != 0 {
+            let i = packet.target[bits.trailing_zeros() as usize & 15] as usize;
+            bits &= bits - 1;
+            blocked[i / 64] |= 1 << (i % 64);
+        }
+        packet.count = 0;
+    }
+
+    /// The shaft around a tile's segments; `None` where it would say nothing.
+    #[inline(always)]
+    fn shaft(&self, points: &[TilePoint], targets: &Targets<'_>) -> Option<Shaft> {
+        type P<S> = <S as Simd>::Packet;
+        let token = self.simd.token();
+        let reference = Vec3::from(points[0].x);
+        let mut here = Around::<P<S>>::new(token, frame_of_points(points)?);
+        let mut k = 0;
+        while k < points.len() {
+            let mut lanes = [[0.0; 16]; 3];
+            let mut lane = 0;
+            while lane < P::<S>::WIDTH {
+                // The last point once more in the lanes beyond it.
+                let at = Vec3::from(points[(k + lane).min(points.len() - 1)].x) - reference;
+                (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (at.x, at.y, at.z);
+                lane += 1;
+            }
+            here.add(token, vec3x::load(token, &lanes, 0));
+            k += P::<S>::WIDTH;
+        }
+        let mut there = Around::<P<S>>::new(token, targets.turn());
+        let mut k = 0;
+        while k < points.len() {
+            // Targets of several points that follow each other are one run.
+            let (first, mut end) = (points[k].first as usize, (points[k].first + points[k].count) as usize);
+            k += 1;
+            while k < points.len() && points[k].first as usize == end {
+                end += points[k].count as usize;
+                k += 1;
+            }
+            let origin = vec3x::splat::<P<S>>(token, reference.to_array());
+            let mut i = first;
+            while i < end {
+                let position = if i + P::<S>::WIDTH <= end {
+                    [
+                        P::<S>::load(token, &targets.axis(0)[i..]),
+                        P::<S>::load(token, &targets.axis(1)[i..]),
+                        P::<S>::load(token, &targets.axis(2)[i..]),
+                    ]
+                } else {
+                    let mut lanes = [[0.0; 16]; 3];
+                    let mut axis = 0;
+                    while axis < 3 {
+                        let all = &targets.axis(axis)[i..end];
+                        lanes[axis] = [all[all.len() - 1]; 16];
+                        lanes[axis][..all.len()].copy_from_slice(all);
+                        axis += 1;
+                    }
+                    vec3x::load(token, &lanes, 0)
+                };
+                there.add(token, vec3x::sub(position, origin));
+                i += P::<S>::WIDTH;
+            }
+        }
+        Shaft::new(reference, &here.finish(), &there.finish(), self.magnitude)
+    }
+
+    /// The whole tree as the only subtree.
+    #[inline(always)]
+    fn whole(&self, cut: &mut Cut) {
+        cut.count = 0;
+        let most = self.magnitude;
+        cut.push(&Entry { child: Child::node(0), bounds: [[-most; 3], [most; 3]] });
+    }
+
+    /// Goes down the tree with the shaft. True if the list holds all that may block anything; else what is not
+    /// in it is below the cut.
+    #[inline(always)]
+    fn gather(
+        &self,
+        shaft: &Shaft,
+        rays: usize,
+        points: usize,
+        cut: &mut Cut,
+        list: &mut List,
+        counter: &mut impl Counter,
+    ) -> bool {
+        let simd = self.simd;
+        let [share, least, most] = STEPS;
+        let steps = (rays / share).clamp(least, most);
+        let room = if rays < FEW * points { 16 } else { 64 };
+        cut.count = 0;
+        let (mut head, mut len) = (0, 0);
+        let mut next = Child::node(0);
+        let mut done = 0;
+        // How far the queue had come when it was last short enough for a cut, and the list empty.
+        let mut saved = (0, 0);
+        loop {
+            if next.is_leaf() {
+                let block = &self.blocks[next.index()];
+                counter.triangle_tests(block.len() as u32);
+                let mut open = shaft.triangles(simd, block);
+                while open != 0 {
+                    let lane = open.trailing_zeros() as usize & 7;
+                    open &= open - 1;
+                    if block.ids[lane] != NO_TRIANGLE {
+                        if list.count == room {
+                            done = steps;
+                            break;
+                        }
+                        list.push(block, lane);
+                    }
+                }
+            } else {
+                let node = &self.nodes[next.index()];
+                counter.node_tests(node.len());
+                let mut met = shaft.children(simd, node);
+                while met != 0 {
+                    let place = met.trailing_zeros() as usize & 7;
+                    met &= met - 1;
+                    if node.children[place] == Child::NONE {
+                        continue;
+                    }
+                    if len == QUEUE {
+                        done = steps;
+                        break;
+                    }
+                    let corner = |side: usize| {
+                        [node.bounds[side][0][place], node.bounds[side][1][place], node.bounds[side][2][place]]
+                    };
+                    cut.queue[len] = Entry { child: node.children[place], bounds: [corner(0), corner(1)] };
+                    len += 1;
+                }
+            }
+            done += 1;
+            if done > steps {
+                break;
+            }
+            if head == len {
+                return true;
+            }
+            if len - head <= CUT && list.count == 0 {
+                saved = (head, len);
+            }
+            next = cut.queue[head].child;
+            head += 1;
+        }
+        // A list that is not all there is would be asked for nothing as often as not.
+        let (head, len) = saved;
+        list.count = 0;
+        if len == 0 {
+            self.whole(cut);
+            return false;
+        }
+        let mut k = head;
+        while k < len {
+            let entry = cut.queue[k];
+            cut.push(&entry);
+            k += 1;
+        }
+        false
+    }
+}
+
+impl Packet {
+    #[inline(always)]
+    fn put(&mut self, x: [f32; 3], target: Vec3, index: usize) {
+        let lane = self.count & 15;
+        let target_at = target.to_array();
+        let mut axis = 0;
+        while axis < 3 {
+            self.origin[axis][lane] = x[axis];
+            self.direction[axis][lane] = target_at[axis] - x[axis];
+            axis += 1;
+        }
+        self.target[lane] = index as u32;
+        self.count += 1;
+    }
+}
+
+/// Three unit vectors at right angles: the first two in the plane of the points, as far as they have one.
+#[inline(always)]
+fn frame_of_points(points: &[TilePoint]) -> Option<[Vec3; 3]> {
+    let n = points.len();
+    let at = |index: usize| Vec3::from(points[index].x);
+    let first = at(0);
+    let (mut normal, mut edge, mut most) = (Vec3::ZERO, Vec3::ZERO, 0.0);
+    // Corners of a square, whether it is stored row by row or along a Z curve, with some points missing or not.
+    let candidates = [[n - 1, n / 8], [n - 1, n / 3], [n / 3, 2 * n / 3], [n - 1, n / 2], [n / 2, n / 8]];
+    let mut k = 0;
+    while k < candidates.len() {
+        let (a, b) = (at(candidates[k][0]) - first, at(candidates[k][1].min(n - 1)) - first);
+        let cross = a.cross(b);
+        let size = cross.length_squared();
+        if size > most {
+            (normal, edge, most) = (cross, b, size);
+        }
+        k += 1;
+    }
+    if !first.is_finite() {
+        return None;
+    }
+    Some(frame(normal, edge))
+}
+
+/// Three unit vectors at right angles, the last along `normal` and the first along `edge`; the axes where these
+/// are no good.
+#[inline(always)]
+pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
+    let (normal, edge) = (normal.normalize_or_zero(), edge.normalize_or_zero());
+    let third = normal.cross(edge);
+    let size = third.length_squared();
+    if size > 0.25 && size < 2.0 { [edge, third, normal] } else { [Vec3::X, Vec3::Y, Vec3::Z] }
+}
+
+/// Clears the bits of `count` targets from the `first`th on.
+#[inline(always)]
+fn clear(blocked: &mut [u64], first: usize, count: usize) {
+    let mut i = first;
+    let end = first + count;
+    while i < end {
+        let (bit, part) = (i % 64, (end - i).min(64 - i % 64));
+        blocked[i / 64] &= !((u64::MAX >> (64 - part)) << bit);
+        i += part;
+    }
+}
+
+/// Sets bits of targets from the `first`th on.
+#[inline(always)]
+fn set(blocked: &mut [u64], first: usize, word: u64) {
+    let bit = first % 64;
+    if word != 0 {
+        blocked[first / 64] |= word << bit;
+        if bit != 0 && word >> (64 - bit) != 0 {
+            blocked[first / 64 + 1] |= word >> (64 - bit);
+        }
+    }
+}
