@@ -62,11 +62,13 @@ fn any_hit(c: &mut Criterion, level: Level, setting: &Setting, binary: &Binary, 
         let first = first.get_or_insert_with(|| answers.clone());
         assert_eq!(*first, answers, "{} differs from {}", method.name, METHODS[0].name);
         let (triangles, nodes) = (counts.triangle_tests as f64 / rays, counts.node_tests as f64 / rays);
-        println!("{}, {}: {triangles:.2} triangle and {nodes:.2} node tests a ray", setting.name, method.name);
+        println!(
+            "{}, {}: {triangles:.2} triangle and {nodes:.2} node tests a ray",
+            setting.name, method.name
+        );
     }
     let first = first.unwrap_or_default();
-    let differ =
-        |other: &[u64]| first.iter().zip(other).map(|(a, b)| (a ^ b).count_ones()).sum::<u32>();
+    let differ = |other: &[u64]| first.iter().zip(other).map(|(a, b)| (a ^ b).count_ones()).sum::<u32>();
     let blocked: u32 = first.iter().map(|word| word.count_ones()).sum();
     binary.answer(&work, &mut answers);
     let by_binary = differ(&answers);

@@ -27,7 +27,7 @@ struct Options {
     #[arg(long, value_delimiter = ',', default_values_t = [1, 16, 64])]
     rays: Vec<usize>,
     /// About how many shaded points a scene.
-    #[arg(long, default_value_t = 8192)]
+    #[arg(long, default_value_t = 32768)]
     points: usize,
     /// Interleaved runs.
     #[arg(long, default_value_t = 7)]
@@ -124,7 +124,8 @@ fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Reco
     {
         for mode in occlude_benches::embree::MODES {
             let Some(tree) = &trees[usize::from(mode.robust)] else { continue };
-            let answer = Box::new(move |work: &Work, blocked: &mut [u64]| tree.answer(mode, level, work, blocked));
+            let answer =
+                Box::new(move |work: &Work, blocked: &mut [u64]| tree.answer(mode, level, work, blocked));
             peers.push(Peer { name: mode.name.to_owned(), family: "embree", answer });
         }
         if let [Some(fast), Some(robust)] = &trees {
@@ -204,11 +205,16 @@ fn contest(peers: &[Peer<'_>], work: &Work, runs: usize) -> Vec<Cell> {
         });
     }
     let best = |cells: &[Cell], family: &str| {
-        cells.iter().filter(|cell| cell.family == family).map(|cell| cell.seconds).fold(f64::INFINITY, f64::min)
+        cells
+            .iter()
+            .filter(|cell| cell.family == family)
+            .map(|cell| cell.seconds)
+            .fold(f64::INFINITY, f64::min)
     };
     let limits = ["ours", "obvhs", "embree"].map(|family| (family, best(&cells, family) * HOPELESS));
     let chance = |cell: &Cell| {
-        cell.family == "ours" || limits.iter().any(|&(family, most)| family == cell.family && cell.seconds <= most)
+        cell.family == "ours"
+            || limits.iter().any(|&(family, most)| family == cell.family && cell.seconds <= most)
     };
     let contenders: Vec<_> = (0..peers.len()).filter(|&i| chance(&cells[i])).collect();
     let mut times = vec![Vec::new(); peers.len()];

@@ -133,19 +133,22 @@ pub struct Setting {
 
 /// The picture that points are taken from, and the tiles that are taken whole.
 const SIZE: (u32, u32) = (1280, 720);
-const TILE: u32 = 8;
+const TILE: u32 = 16;
+
+/// With as many samples a point or more, a tile is asked about in four parts, as the host does.
+const PARTED: usize = 4;
 
 /// The seeds of the rays measured, and of those that tell the classes.
 const SEEDS: [u64; 2] = [1, 2];
 
 impl Setting {
-    /// Finds the first hits of the scene's camera in as many tiles of 8 by 8 pixels, evenly spread over the
+    /// Finds the first hits of the scene's camera in as many tiles of 16 by 16 pixels, evenly spread over the
     /// picture, as give about so many points.
     pub fn new(name: &str, scene: Scene, points: usize) -> Self {
         let accel = Accel::build(&scene, Quality::default());
         let lights = lights(&scene);
         let all = dispatch(detect(), FirstHits { bvh: accel.bvh(), scene: &scene });
-        let tiles: Vec<_> = all.chunk_by(|a, b| a.tile == b.tile).collect();
+        let tiles: Vec<_> = all.chunk_by(|a, b| a.tile / 4 == b.tile / 4).collect();
         let each = (TILE * TILE) as usize;
         let kept = (points / each).clamp(1, tiles.len().max(1)).min(tiles.len());
         let clearance = accel.bvh().clearance();
@@ -229,7 +232,8 @@ impl Setting {
         let last = work.rays() as u32;
         if last > first {
             let index = work.batches.len() as u32;
-            let place = (pair.tile, pair.light);
+            let part = if n < PARTED { 4 } else { 1 };
+            let place = (pair.tile / part, pair.light);
             match work.tiles.last_mut() {
                 Some(tile) if work.place == Some(place) => tile.end = index + 1,
                 _ => work.tiles.push(index..index + 1),
@@ -268,7 +272,13 @@ impl Task for FirstHits<'_> {
         (camera.width, camera.height) = SIZE;
         let frame = camera.frame();
         for (index, tile) in (0..).zip(Tile::cover(width, height, TILE)) {
-            for pixel in 0..tile.len() {
+            let quarter = |pixel: &usize| {
+                let (x, y) = tile.position(*pixel);
+                2 * ((y - tile.y) / (TILE / 2)) + (x - tile.x) / (TILE / 2)
+            };
+            let mut pixels: Vec<usize> = (0..tile.len()).collect();
+            pixels.sort_by_key(quarter);
+            for pixel in pixels {
                 let (px, py) = tile.position(pixel);
                 let toward = frame.ray_direction(px as f32 + 0.5, py as f32 + 0.5);
                 let ray = Ray::from(camera.eye, toward);
@@ -282,7 +292,7 @@ impl Task for FirstHits<'_> {
                 let normal = normal.as_vec3();
                 found.push(FirstHit {
                     pixel: u64::from(py) * u64::from(width) + u64::from(px),
-                    tile: index,
+                    tile: 4 * index + quarter(&pixel),
                     x: a * (1.0 - hit.u - hit.v) + b * hit.u + c * hit.v,
                     normal: if normal.dot(toward) < 0.0 { normal } else { -normal },
                 });

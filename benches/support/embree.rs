@@ -27,7 +27,12 @@ struct Context {
 
 impl Context {
     fn new(coherent: bool) -> Self {
-        Self { flags: c_uint::from(coherent), filter: std::ptr::null(), instance: c_uint::MAX, min_width: 0.0 }
+        Self {
+            flags: c_uint::from(coherent),
+            filter: std::ptr::null(),
+            instance: c_uint::MAX,
+            min_width: 0.0,
+        }
     }
 }
 
@@ -125,7 +130,8 @@ impl Embree {
             let geometry = rtcNewGeometry(device, TRIANGLES);
             rtcSetGeometryBuildQuality(geometry, HIGH);
             let (points, faces) = (scene.positions.len(), scene.triangles.len());
-            let vertices = rtcSetNewGeometryBuffer(geometry, VERTICES, 0, FLOAT3, 12, points).cast::<[f32; 3]>();
+            let vertices =
+                rtcSetNewGeometryBuffer(geometry, VERTICES, 0, FLOAT3, 12, points).cast::<[f32; 3]>();
             let indices = rtcSetNewGeometryBuffer(geometry, INDICES, 0, UINT3, 12, faces).cast::<[u32; 3]>();
             if !vertices.is_null() && !indices.is_null() {
                 for (i, position) in scene.positions.iter().enumerate() {

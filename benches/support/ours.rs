@@ -4,7 +4,9 @@ use crate::Work;
 use crate::pack::{Tracer, pack};
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
-use occlude_kernel::{BatchScratch, Bvh, Counter, Counts, Ray, RayPacket, Simd, Targets, TilePoint, TileScratch, Uncounted};
+use occlude_kernel::{
+    BatchScratch, Bvh, Counter, Counts, Ray, RayPacket, Simd, Targets, TilePoint, TileScratch, Uncounted,
+};
 
 /// One way to answer.
 #[derive(Clone, Copy)]
@@ -180,7 +182,7 @@ impl<C: Counter> Task for Tiles<'_, C> {
         let bvh = self.bvh.on(simd);
         let [x, y, z] = &self.work.targets;
         let mut scratch = TileScratch::new();
-        let mut points = [TilePoint::default(); 64];
+        let mut points = [TilePoint::default(); 256];
         let mut answers = [0; 64];
         let mut index = 0;
         while index < self.work.tiles.len() {
@@ -191,7 +193,8 @@ impl<C: Counter> Task for Tiles<'_, C> {
             while k < end {
                 let batch = &self.work.batches[k];
                 let count = batch.last - batch.first;
-                points[k - begin] = TilePoint { x: batch.origin.to_array(), first: batch.first - first, count };
+                points[k - begin] =
+                    TilePoint { x: batch.origin.to_array(), first: batch.first - first, count };
                 k += 1;
             }
             let (from, to) = (first as usize, self.work.batches[end - 1].last as usize);

@@ -102,9 +102,9 @@ impl Record {
     }
 
     fn of<'a>(&'a self, scene: &'a str, rays: usize, class: &'a str) -> impl Iterator<Item = &'a Cell> {
-        self.cells.iter().filter(move |cell| {
-            cell.scene == scene && cell.rays_per_point == rays && cell.class == class
-        })
+        self.cells
+            .iter()
+            .filter(move |cell| cell.scene == scene && cell.rays_per_point == rays && cell.class == class)
     }
 
     fn best<'a>(&'a self, scene: &'a str, rays: usize, class: &'a str, family: &str) -> Option<&'a Cell> {
@@ -165,7 +165,8 @@ impl Record {
             if ratios.is_empty() {
                 continue;
             }
-            let worst = ratios.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(("", f64::NAN), |&worst| worst);
+            let worst =
+                ratios.iter().min_by(|a, b| a.1.total_cmp(&b.1)).map_or(("", f64::NAN), |&worst| worst);
             let _ = writeln!(
                 text,
                 "N = {rays}: best of Embree over ours, geometric mean of {} scenes {mean:.2}, least {:.2} ({})",
@@ -179,7 +180,8 @@ impl Record {
 
     /// Everything measured, one line a peer and question.
     pub fn csv(&self) -> String {
-        let mut text = String::from("scene,rays_per_point,class,peer,ns_per_ray,us_per_point,rays,runs,differ\n");
+        let mut text =
+            String::from("scene,rays_per_point,class,peer,ns_per_ray,us_per_point,rays,runs,differ\n");
         for cell in &self.cells {
             let _ = writeln!(
                 text,
@@ -214,15 +216,16 @@ impl Record {
         for rays in self.numbers() {
             let (_, mean) = self.ratios(rays, "all");
             let _ = write!(text, "\n## N = {rays}");
-            let names: Vec<_> = self.cells.iter().filter(|cell| cell.family == "ours").map(|cell| &cell.peer).fold(
-                Vec::new(),
-                |mut names, name| {
-                    if !names.contains(&name) {
-                        names.push(name);
-                    }
-                    names
-                },
-            );
+            let names: Vec<_> =
+                self.cells.iter().filter(|cell| cell.family == "ours").map(|cell| &cell.peer).fold(
+                    Vec::new(),
+                    |mut names, name| {
+                        if !names.contains(&name) {
+                            names.push(name);
+                        }
+                        names
+                    },
+                );
             if mean.is_finite() {
                 let _ = write!(text, ": geometric mean of the ratios {mean:.2}");
             }
@@ -248,8 +251,10 @@ impl Record {
                         }
                         None => text.push_str(" | |"),
                     }
-                    let obvhs = self.best(&row.scene, rays, class, "obvhs").map_or(f64::NAN, Cell::ns_per_ray);
-                    let embree = self.best(&row.scene, rays, class, "embree").map_or(f64::NAN, |cell| cell.seconds);
+                    let obvhs =
+                        self.best(&row.scene, rays, class, "obvhs").map_or(f64::NAN, Cell::ns_per_ray);
+                    let embree =
+                        self.best(&row.scene, rays, class, "embree").map_or(f64::NAN, |cell| cell.seconds);
                     let _ = writeln!(text, " {obvhs:.2} | {:.2} |", embree / ours.seconds);
                 }
             }

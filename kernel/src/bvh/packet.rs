@@ -36,7 +36,14 @@ pub(super) trait PacketVisitor<L: Lanes> {
     const ANY: bool = false;
 
     /// Takes hits on the triangle in a lane of a block: rays of `bits`. Gives the rays that need no more.
-    fn hits(&mut self, bits: u32, block: &TriangleBlock, lane: usize, found: &Found, t_max: &mut [f32; 16]) -> u32;
+    fn hits(
+        &mut self,
+        bits: u32,
+        block: &TriangleBlock,
+        lane: usize,
+        found: &Found,
+        t_max: &mut [f32; 16],
+    ) -> u32;
 }
 
 /// Hears of the rays, by bits, that the triangle in a lane of a block blocks.
@@ -366,8 +373,7 @@ impl<S: Simd> Bvh<'_, S> {
     ) {
         let token = self.simd.token();
         let sheared = Sheared::new(token, axes, rays.origin, rays.direction, rays.t_min, rays.t_max);
-        let mut this =
-            Going { sheared, t_max: [0.0; 16], found: Found::NOTHING, active, entry: [0.0; 16] };
+        let mut this = Going { sheared, t_max: [0.0; 16], found: Found::NOTHING, active, entry: [0.0; 16] };
         this.sheared.t_max.store(&mut this.t_max);
         // The child, the rays that meet its box, and where the first of them enters it.
         let mut stack = ArrayVec::<(Child, u32, f32), STACK>::new();
@@ -537,5 +543,6 @@ pub(super) struct Start<'c> {
 
 impl Start<'_> {
     /// At the root.
-    pub(super) const ROOT: Start<'static> = Start { root: true, blocks: &[], nodes: &[], entries: &[], shift: 0 };
+    pub(super) const ROOT: Start<'static> =
+        Start { root: true, blocks: &[], nodes: &[], entries: &[], shift: 0 };
 }

@@ -811,15 +811,8 @@ impl<S: Simd> Bvh<'_, S> {
                         }
                     }
                 } else {
-                    let blocked = self.block_blocked(
-                        pyramid,
-                        block,
-                        &mut going.forms,
-                        ask,
-                        ignore,
-                        counter,
-                        learner,
-                    );
+                    let blocked =
+                        self.block_blocked(pyramid, block, &mut going.forms, ask, ignore, counter, learner);
                     going.free &= !blocked;
                 }
             } else if ask.count_ones() <= LONE && going.visits > EASY {

@@ -54,7 +54,8 @@ impl<L: Lanes> Around<L> {
         let mut turned = Turned { middle: Vec3::ZERO, axes: [Vec3::ZERO; 3] };
         let mut k = 0;
         while k < 3 {
-            let (low, high) = (super::pyramid::least_of(self.low[k]), super::pyramid::greatest_of(self.high[k]));
+            let (low, high) =
+                (super::pyramid::least_of(self.low[k]), super::pyramid::greatest_of(self.high[k]));
             turned.middle += self.frame[k] * (0.5 * (low + high));
             turned.axes[k] = self.frame[k] * (0.5 * (high - low));
             k += 1;
@@ -96,6 +97,8 @@ const PLANES: usize = 10;
 pub(super) struct Shaft {
     /// What the corners are counted from.
     reference: Vec3,
+    /// From the middle of the points to that of the targets.
+    between: Vec3,
     planes: [Plane; PLANES],
     lower: Vec3,
     upper: Vec3,
@@ -156,13 +159,24 @@ impl Shaft {
         }
         let between = targets.middle - points.middle;
         let face = |normal: Vec3, toward: Vec3| if normal.dot(toward) < 0.0 { -normal } else { normal };
-        planes[8] = Self::plane(reference, face(points.axes[0].cross(points.axes[1]), between), points, targets, position);
-        planes[9] =
-            Self::plane(reference, face(targets.axes[0].cross(targets.axes[1]), -between), points, targets, position);
+        planes[8] = Self::plane(
+            reference,
+            face(points.axes[0].cross(points.axes[1]), between),
+            points,
+            targets,
+            position,
+        );
+        planes[9] = Self::plane(
+            reference,
+            face(targets.axes[0].cross(targets.axes[1]), -between),
+            points,
+            targets,
+            position,
+        );
         // Positions are rounded when they are counted from the reference, and again when the result is moved back.
         let slack = Vec3::splat(4.0 * position);
         let (lower, upper) = (reference + lower - slack, reference + upper + slack);
-        Some(Self { reference, planes, lower, upper, corners, farthest })
+        Some(Self { reference, between, planes, lower, upper, corners, farthest })
     }
 
     /// Both boxes are on the positive side. A normal of next to no length culls nothing.
@@ -175,6 +189,12 @@ impl Shaft {
         let normal = normal / size;
         let least = points.least(normal).min(targets.least(normal));
         Plane::new(normal, -least, reference, 4.0 * position)
+    }
+
+    /// How far from the points a box is, on the way to the targets, in no particular unit.
+    #[inline(always)]
+    pub(super) fn depth(&self, lower: Vec3, upper: Vec3) -> f32 {
+        ((lower + upper) * 0.5 - self.reference).dot(self.between)
     }
 
     /// Which children of a node the shaft may meet.

@@ -294,7 +294,8 @@ impl<S: Simd> Bvh<'_, S> {
                 let node = &self.nodes[next.index()];
                 counter.node_tests(node.len());
                 // Depth is checked at construction, so there is always room.
-                levels[level] = (next.index() as u32, slabs.children(token, node, visitor.t_max(), &mut entry));
+                levels[level] =
+                    (next.index() as u32, slabs.children(token, node, visitor.t_max(), &mut entry));
                 level += 1;
             }
             next = loop {

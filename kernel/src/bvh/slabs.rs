@@ -218,10 +218,7 @@ impl<L: Lanes> PacketSlabs<L> {
     fn planes(&self, token: L::Token, node: &Node, place: usize, axis: usize, near_side: usize) -> (L, L) {
         let near = L::splat(token, node.bounds[near_side & 1][axis][place]);
         let far = L::splat(token, node.bounds[near_side & 1 ^ 1][axis][place]);
-        (
-            near.mul_add(self.inverse[axis], self.near[axis]),
-            far.mul_add(self.inverse[axis], self.far[axis]),
-        )
+        (near.mul_add(self.inverse[axis], self.near[axis]), far.mul_add(self.inverse[axis], self.far[axis]))
     }
 
     #[inline(always)]

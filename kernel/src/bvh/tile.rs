@@ -14,6 +14,7 @@ use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::triangle::{NO_TRIANGLE, TriangleBlock};
 use crate::vec3x;
+use arrayvec::ArrayVec;
 use glam::Vec3;
 
 /// A point of a tile, and which of the targets it asks about.
@@ -200,7 +201,7 @@ const FADING: f32 = 0.75;
 
 /// A triangle that blocks as many targets at once is learned.
 const LEARN: u32 = 1;
-const CREDIT: u32 = 4;
+const CREDIT: u32 = 3;
 const LEAST_SCORE: f32 = -4.0;
 
 impl Learner for List {
@@ -221,8 +222,7 @@ struct Packet {
 }
 
 impl Packet {
-    const EMPTY: Self =
-        Self { origin: [[0.0; 16]; 3], direction: [[0.0; 16]; 3], target: [0; 16], count: 0 };
+    const EMPTY: Self = Self { origin: [[0.0; 16]; 3], direction: [[0.0; 16]; 3], target: [0; 16], count: 0 };
 }
 
 /// Steps a shaft may take for each ray of its tile, and at most.
@@ -251,9 +251,9 @@ impl<S: Simd> Bvh<'_, S> {
         let mut rays = 0;
         let mut k = 0;
         while k < points.len() {
-            clear(blocked, points[k].first as usize, points[k].count as usize);
-            rays += points[k].count as usize;
-            k += 1;
+            let (first, end) = run(points, &mut k);
+            clear(blocked, first, end - first);
+            rays += end - first;
         }
         if rays == 0 || self.nodes.is_empty() {
             counter.rays(rays as u32);
@@ -290,7 +290,8 @@ impl<S: Simd> Bvh<'_, S> {
                         i += 1;
                     }
                 } else if complete {
-                    let word = if batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude) {
+                    let word = if batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude)
+                    {
                         counter.rays(part as u32);
                         let every = batch.pyramid.every();
                         every & !self.list_leaves(batch, given, false, ignore, counter)
@@ -314,9 +315,8 @@ impl<S: Simd> Bvh<'_, S> {
                     if ask != 0 {
                         let start =
                             Start { root: false, blocks: &[], nodes: cut.nodes(), entries: &[], shift: 0 };
-                        word |= self.packets_blocked(
-                            &start, x, targets, from, part, ask, ignore, counter, learned,
-                        );
+                        word |= self
+                            .packets_blocked(&start, x, targets, from, part, ask, ignore, counter, learned);
                     }
                     set(blocked, from, word);
                 }
@@ -406,13 +406,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut there = Around::<P<S>>::new(token, targets.turn());
         let mut k = 0;
         while k < points.len() {
-            // Targets of several points that follow each other are one run.
-            let (first, mut end) = (points[k].first as usize, (points[k].first + points[k].count) as usize);
-            k += 1;
-            while k < points.len() && points[k].first as usize == end {
-                end += points[k].count as usize;
-                k += 1;
-            }
+            let (first, end) = run(points, &mut k);
             let origin = vec3x::splat::<P<S>>(token, reference.to_array());
             let mut i = first;
             while i < end {
@@ -501,7 +495,11 @@ impl<S: Simd> Bvh<'_, S> {
                         break;
                     }
                     let corner = |side: usize| {
-                        [node.bounds[side][0][place], node.bounds[side][1][place], node.bounds[side][2][place]]
+                        [
+                            node.bounds[side][0][place],
+                            node.bounds[side][1][place],
+                            node.bounds[side][2][place],
+                        ]
                     };
                     cut.queue[len] = Entry { child: node.children[place], bounds: [corner(0), corner(1)] };
                     len += 1;
@@ -527,9 +525,24 @@ impl<S: Simd> Bvh<'_, S> {
             self.whole(cut);
             return false;
         }
+        // The nearest come last, where a stack begins.
+        let mut order = ArrayVec::<(f32, usize), CUT>::new();
         let mut k = head;
         while k < len {
-            let entry = cut.queue[k];
+            let [lower, upper] = cut.queue[k].bounds;
+            let depth = shaft.depth(Vec3::from(lower), Vec3::from(upper));
+            let mut slot = order.len();
+            order.push((depth, k));
+            while slot > 0 && order[slot - 1].0 < depth {
+                order[slot] = order[slot - 1];
+                slot -= 1;
+            }
+            order[slot] = (depth, k);
+            k += 1;
+        }
+        let mut k = 0;
+        while k < order.len() {
+            let entry = cut.queue[order[k].1];
             cut.push(&entry);
             k += 1;
         }
@@ -586,6 +599,18 @@ pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
     let third = normal.cross(edge);
     let size = third.length_squared();
     if size > 0.25 && size < 2.0 { [edge, third, normal] } else { [Vec3::X, Vec3::Y, Vec3::Z] }
+}
+
+/// The targets of points from the `k`th on that follow each other; `k` becomes the first point that breaks off.
+#[inline(always)]
+fn run(points: &[TilePoint], k: &mut usize) -> (usize, usize) {
+    let first = points[*k].first;
+    let mut end = first;
+    while *k < points.len() && points[*k].first == end {
+        end += points[*k].count;
+        *k += 1;
+    }
+    (first as usize, end as usize)
 }
 
 /// Clears the bits of `count` targets from the `first`th on.
