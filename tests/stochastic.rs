@@ -6,7 +6,6 @@
 
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
-use occlude_host::film::Image;
 use occlude_host::generate::{Kind, generate};
 use occlude_host::integrator::{
     Exact, Form, Questions, Rule, Settings, Split, Stage, Stochastic, Visibility,
@@ -51,7 +50,7 @@ impl Setting {
             lights: &self.lights,
             eye: camera.eye,
             camera: &frame,
-            shadow_rays: 12,
+            shadow_rays: SHADOW_RAYS,
             pattern: Pattern::default(),
             seed: 3,
             level: levels().nth(simd).unwrap_or_else(detect),
@@ -93,24 +92,33 @@ impl Visibility for Dark {
 }
 
 const BLOCK: u32 = 16;
+const SHADOW_RAYS: u32 = 12;
 
 /// The block whose mean is the most standard errors away from 0, and how many.
-fn worst(difference: &Rendered, dark: &Image) -> (f64, String) {
+///
+/// Where a learned residual errs rarely, and then by 16, it may not have erred yet, and the passes know of no noise. So
+/// for `rare` two errors more are allowed for, each a sample of the block's brightest pixel.
+fn worst(setting: &Setting, difference: &Rendered, rare: bool) -> (f64, String) {
+    let passes = difference.passes;
+    let [dark, lit] =
+        [&Dark as &dyn Visibility, &Exact].map(|method| setting.render(method, passes, 0, 0).film.develop());
+    let error_of = if rare { 2.0 * 16.0 / f64::from(SHADOW_RAYS * passes) } else { 0.0 };
     let (mean, error) = (difference.film.develop(), difference.film.standard_error());
     let (mut worst, mut told) = (0.0f64, String::new());
     let mut noisy = 0;
     for top in (0..mean.height).step_by(BLOCK as usize) {
         for left in (0..mean.width).step_by(BLOCK as usize) {
-            let (mut sum, mut variance) = (0.0, 0.0);
+            let (mut sum, mut variance, mut brightest) = (0.0, 0.0, 0.0f64);
             for y in top..(top + BLOCK).min(mean.height) {
                 for x in left..(left + BLOCK).min(mean.width) {
                     let at = (y * mean.width + x) as usize;
                     sum += f64::from(mean.pixels[at][1] - dark.pixels[at][1]);
                     variance += f64::from(error.pixels[at][1]).powi(2);
+                    brightest = brightest.max(f64::from(lit.pixels[at][1] - dark.pixels[at][1]));
                 }
             }
             noisy += u32::from(variance > 1e-12);
-            let off = sum / (variance + 1e-12).sqrt();
+            let off = sum / (variance + (error_of * brightest).powi(2) + 1e-12).sqrt();
             if off.abs() > worst.abs() {
                 (worst, told) = (off, format!("block at {left}, {top}: {off:+.2} standard errors"));
             }
@@ -124,9 +132,9 @@ const FORMS: [Form; 4] = [Form::InclusionExclusion, Form::Balanced, Form::Power(
 const SPLITS: [Split; 3] = [Split::Random, Split::Sorted, Split::Object];
 
 fn check(setting: &Setting, settings: Settings, passes: u32) {
-    let dark = setting.render(&Dark, passes, 0, 0).film.develop();
     let difference = setting.render(&Less(setting.method(settings), |x| x), passes, 0, 0);
-    let (off, told) = worst(&difference, &dark);
+    let learned = settings.form == Form::Residual && settings.rule == Rule::Optimal;
+    let (off, told) = worst(setting, &difference, learned);
     println!("{}, {settings}: {told}", setting.scene.name);
     assert!(off < 5.0, "{}, {settings}: {told}", setting.scene.name);
 }
@@ -192,12 +200,12 @@ fn images_are_right_on_average_long() {
 #[test]
 fn bias_is_found() {
     let setting = Setting::own("plates", (48, 48));
-    let dark = setting.render(&Dark, 24, 0, 0).film.develop();
     let method = || setting.method(Settings::default());
-    let (off, _) = worst(&setting.render(&Less(method(), |x: f32| x.clamp(0.0, 1.0)), 24, 0, 0), &dark);
+    let (off, _) =
+        worst(&setting, &setting.render(&Less(method(), |x: f32| x.clamp(0.0, 1.0)), 24, 0, 0), false);
     assert!(off > 20.0, "clamping goes unnoticed: {off}");
     let residual = setting.method(Settings { form: Form::Residual, ..Settings::default() });
-    let (off, _) = worst(&setting.render(&Less(residual, |x: f32| 0.99 * x), 24, 0, 0), &dark);
+    let (off, _) = worst(&setting, &setting.render(&Less(residual, |x: f32| 0.99 * x), 24, 0, 0), false);
     assert!(off > 5.0, "a hundredth goes unnoticed: {off}");
 }
 
