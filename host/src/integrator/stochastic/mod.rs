@@ -302,7 +302,7 @@ struct Work<'a> {
     point: Option<u32>,
     random: Sampler,
     groups: Vec<u8>,
-    order: Vec<(f32, u32)>,
+    order: Vec<u64>,
 
     origin: Vec3,
     light: &'a AreaLight,
