@@ -2,7 +2,7 @@
 
 use glam::{DVec3, Vec3};
 use occlude_host::accel::{Accel, Quality};
-use occlude_kernel::{BatchScratch, Counts, Ray, RayPacket, Targets, Uncounted};
+use occlude_kernel::{BatchScratch, Counts, Ray, RayPacket, Targets, TilePoint, TileScratch, Uncounted};
 use occlude_tests::meshes::{self, Indexed};
 use occlude_tests::{Family, On, Random};
 use rayon::prelude::*;
@@ -84,25 +84,22 @@ impl Closed {
         if target == x { Ray::from(x, Vec3::X) } else { Ray::from(x, target - x) }
     }
 
-    /// How many of this many rays leave, as packets of 16 from one point each and batches of 16.
+    /// How many of about this many rays leave, as packets of 16 from one point each, batches of 16 and tiles of 64.
     fn leaks(&self, family: Family, seed: u64, rays: usize) -> usize {
         let on = On { bvh: self.accel.bvh(), family };
         let mut random = Random::new(seed);
         let mut leaks = 0;
         for round in 0..rays / 16 {
             let x = self.inner_point(&mut random);
-            if round % 2 == 0 {
+            if round % 8 == 7 {
+                leaks += self.tile_leaks(&on, &mut random, if round % 16 == 7 { 1 } else { 8 });
+            } else if round % 2 == 0 {
                 let rays: [Ray; 16] = std::array::from_fn(|_| self.ray(x, &mut random));
                 let packet = RayPacket::new(&rays);
                 let blocked = family.run(Packet { on: &on, packet: &packet });
                 leaks += blocked.count_zeros() as usize - 16;
             } else {
-                // Beyond the mesh, so that the segment must cross it.
-                let ends: [Vec3; 16] = std::array::from_fn(|_| {
-                    let target = self.target(&mut random);
-                    let toward = if target == x { self.scale } else { target - x };
-                    x + toward * (4.0 * self.scale.max_element() / toward.abs().max_element())
-                });
+                let ends: [Vec3; 16] = std::array::from_fn(|_| self.beyond(x, &mut random));
                 let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.map(|end| end[axis]));
                 let targets = Targets::new(&xs, &ys, &zs).expect("of one length");
                 let mut blocked = [0];
@@ -118,6 +115,42 @@ impl Closed {
             }
         }
         leaks
+    }
+
+    /// Beyond the mesh, so that the segment must cross it.
+    fn beyond(&self, x: Vec3, random: &mut Random) -> Vec3 {
+        let target = self.target(random);
+        let toward = if target == x { self.scale } else { target - x };
+        x + toward * (4.0 * self.scale.max_element() / toward.abs().max_element())
+    }
+
+    /// How many of 64 rays leave, as a tile of points with so many targets each: half of the tiles anywhere inside,
+    /// half of them around one point.
+    fn tile_leaks(&self, on: &On<'_>, random: &mut Random, each: usize) -> usize {
+        let (mut points, mut ends) = (Vec::new(), Vec::new());
+        let middle = self.inner_point(random);
+        let near = random.bits() & 1 == 0;
+        while points.len() < 64 / each {
+            let mut x = self.inner_point(random);
+            let close = middle + (x - middle) * 1e-2;
+            if near && self.holds(close) {
+                x = close;
+            }
+            points.push(TilePoint { x: x.into(), first: ends.len() as u32, count: each as u32 });
+            ends.extend((0..each).map(|_| self.beyond(x, random)));
+        }
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let targets = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let mut blocked = [0];
+        on.occluded_tile(
+            &points,
+            &targets,
+            None,
+            &mut Counts::default(),
+            &mut TileScratch::new(),
+            &mut blocked,
+        );
+        blocked[0].count_zeros() as usize
     }
 }
 

@@ -6,7 +6,7 @@ use glam::{DVec3, Vec3};
 use occlude_kernel::lanes::{self, Level, Task};
 use occlude_kernel::{
     BatchScratch, Bvh, Child, Counts, Hit, HitPacket, Native, Node, Ray, RayPacket, Scalar, Simd, Targets,
-    TriangleBlock, Uncounted,
+    TilePoint, TileScratch, TriangleBlock, Uncounted,
 };
 use rand_xoshiro::Xoshiro256PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
@@ -171,6 +171,8 @@ impl On<'_> {
         counts: &'q mut Counts, visit: &'q mut dyn FnMut(usize, Hit) -> ControlFlow<()>) -> ());
     query!('q, occluded_batch(x: [f32; 3], targets: &'q Targets<'q>, ignore: Option<u32>,
         counts: &'q mut Counts, scratch: &'q mut BatchScratch, blocked: &'q mut [u64]) -> ());
+    query!('q, occluded_tile(points: &'q [TilePoint], targets: &'q Targets<'q>, ignore: Option<u32>,
+        counts: &'q mut Counts, scratch: &'q mut TileScratch, blocked: &'q mut [u64]) -> ());
 
     /// Every hit of a ray, nearest first.
     pub fn hits(&self, ray: &Ray, ignore: Option<u32>) -> Vec<Hit> {

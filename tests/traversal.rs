@@ -2,7 +2,7 @@
 
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
-use occlude_kernel::{BatchScratch, Bvh, Counts, Hit, Ray, RayPacket, Targets};
+use occlude_kernel::{BatchScratch, Bvh, Counts, Hit, Ray, RayPacket, Targets, TilePoint, TileScratch};
 use occlude_tests::{On, Oracle, Random, Triangle, all_bits, bits, families, meshes, single_node};
 use proptest::prelude::*;
 use std::ops::ControlFlow;
@@ -73,6 +73,43 @@ impl Case {
         }
     }
 
+    /// Asks about segments from several points, as a tile, with and without a plane said to hold the targets.
+    fn check_tile(&self, points: &[(Vec3, Vec<Vec3>)], ignore: Option<u32>) {
+        let ends: Vec<Vec3> = points.iter().flat_map(|point| point.1.iter().copied()).collect();
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let some = |i: usize| ends.get(i).copied().unwrap_or(Vec3::ONE);
+        let flat = any.on_parallelogram(some(0), some(1) - some(0), some(2) - some(0));
+        let mut first = 0;
+        let askers: Vec<TilePoint> = points
+            .iter()
+            .map(|(x, ends)| {
+                first += ends.len() as u32;
+                TilePoint { x: x.to_array(), first: first - ends.len() as u32, count: ends.len() as u32 }
+            })
+            .collect();
+        let want: Vec<bool> = points
+            .iter()
+            .flat_map(|(x, ends)| ends.iter().map(|&end| Ray::segment(*x, end)))
+            .map(|ray| self.oracle.hits(&ray, ignore).iter().any(|hit| Some(hit.triangle) != ignore))
+            .collect();
+        let mut scratch = TileScratch::new();
+        for on in families(self.accel.bvh()) {
+            for targets in [any, flat] {
+                let mut blocked = vec![0xdead_beef_dead_beef; ends.len() / 64 + 2];
+                let mut counts = Counts::default();
+                on.occluded_tile(&askers, &targets, ignore, &mut counts, &mut scratch, &mut blocked);
+                for (i, want) in want.iter().enumerate() {
+                    let found = blocked[i / 64] >> (i % 64) & 1 != 0;
+                    assert_eq!(found, *want, "{}: target {i}, {points:?}", on.family);
+                }
+                let beyond = ends.len() % 64;
+                assert_eq!(blocked[ends.len() / 64] >> beyond, 0xdead_beef_dead_beef >> beyond, "left alone");
+                assert_eq!(counts.rays, ends.len() as u64);
+            }
+        }
+    }
+
     /// A ray among the triangles: to a point of one, to a vertex, along an edge's middle, or anywhere.
     fn ray(&self, random: &mut Random) -> Ray {
         let any = |random: &mut Random| self.triangles[random.below(self.triangles.len())];
@@ -113,6 +150,26 @@ impl Case {
             let count = random.below(40);
             let ends: Vec<Vec3> = (0..count).map(|_| self.ray(random).at(1.0)).collect();
             self.check_batch(rays[0].origin, &ends, ignore);
+            // Points near each other, or not; targets on a parallelogram, or not.
+            let (near, flat) = (random.bits() & 1 == 0, random.bits() & 1 == 0);
+            let (corner, u, v) = (self.ray(random).at(1.0), random.point(), random.point());
+            let (parts, span) = (1 + random.below(9), self.span());
+            let points: Vec<(Vec3, Vec<Vec3>)> = (0..parts)
+                .map(|_| {
+                    let x = if near {
+                        rays[1].origin + random.point() * (1e-2 * span)
+                    } else {
+                        self.ray(random).origin
+                    };
+                    let end = |random: &mut Random| match flat {
+                        true => corner + (u * random.between(0.0, 1.0) + v * random.between(0.0, 1.0)) * span,
+                        false => self.ray(random).at(1.0),
+                    };
+                    let count = random.below(20);
+                    (x, (0..count).map(|_| end(random)).collect())
+                })
+                .collect();
+            self.check_tile(&points, ignore);
         }
     }
 }
@@ -410,6 +467,8 @@ fn batches_with_ends_that_are_nothing() {
     }
     case.check_batch(x, &ends, None);
     case.check_batch(Vec3::NAN, &ends, None);
+    case.check_tile(&[(x, ends.clone()), (Vec3::NAN, ends.clone()), (x, ends.clone())], None);
+    case.check_tile(&[], None);
 }
 
 #[test]
@@ -442,10 +501,17 @@ fn counts_are_lanes_in_use() {
         let packet = RayPacket::new(&[here, there, here, nowhere]);
         on.closest_packet(&packet, 0b1111, None, &mut counts);
         assert_eq!(counts, Counts { rays: 4, triangle_tests: 8 + 2 + 8, node_tests: 3 * 2 }, "{}", on.family);
-        // Only one triangle is needed to know that there is one.
+        // So few rays go on one by one, and one ray tests a block at once.
         let mut counts = Counts::default();
         on.occluded_packet(&packet, 0b1111, None, &mut counts);
-        assert_eq!(counts, Counts { rays: 4, triangle_tests: 3, node_tests: 3 * 2 }, "{}", on.family);
+        assert_eq!(counts, Counts { rays: 4, triangle_tests: 8 + 2 + 8, node_tests: 3 * 2 }, "{}", on.family);
+    }
+    // In a packet that stays together only one triangle is needed to know that there is one.
+    for on in families(bvh).into_iter().filter(|on| on.family.packet_width() > 5) {
+        let mut counts = Counts::default();
+        let packet = RayPacket::new(&[here; 6]);
+        on.occluded_packet(&packet, 0b11_1111, None, &mut counts);
+        assert_eq!(counts, Counts { rays: 6, triangle_tests: 6, node_tests: 6 * 2 }, "{}", on.family);
     }
     let mut sum = Counts { rays: 1, triangle_tests: 2, node_tests: 3 };
     sum += sum;

@@ -26,14 +26,20 @@
 
 pub mod bvh;
 pub mod counter;
+pub mod decomposition;
+pub mod estimator;
 pub mod lanes;
 pub mod polygon;
 pub mod ray;
 pub mod triangle;
 mod vec3x;
 
-pub use bvh::{BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Targets, TilePoint, TileScratch, offset};
+pub use bvh::{
+    BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Part, Targets, TilePoint, TileScratch, offset,
+};
 pub use counter::{Counter, Counts, Uncounted};
+pub use decomposition::{Costs, Decomposition, EstimatorError, Group, Joint, Need, Needs, Tally};
+pub use estimator::{Estimator, Exact, Halving, Levels, OneTerm, Probabilities, Quotas};
 pub use lanes::{Native, Scalar, Simd};
 pub use ray::{Hit, Ray, RayPacket};
 pub use triangle::{NO_TRIANGLE, TriangleBlock};

@@ -3,9 +3,9 @@
 use super::{Questions, Stage, Visibility};
 use crate::light::AreaLight;
 use occlude_kernel::lanes::{Task, dispatch};
-use occlude_kernel::{BatchScratch, Bvh, Counter, Counts, Simd, Targets, Uncounted};
+use occlude_kernel::{Bvh, Counter, Counts, Simd, Targets, TilePoint, TileScratch, Uncounted};
 
-/// Traces every shadow ray through the scene's tree, a batch at a time.
+/// Traces every shadow ray through the scene's tree, a tile and a light at a time.
 #[derive(Clone, Copy, Debug, Default)]
 pub struct Exact;
 
@@ -17,17 +17,58 @@ impl Visibility for Exact {
         estimates: &mut Vec<f32>,
         counts: &mut Counts,
     ) {
-        estimates.clear();
-        let bvh = stage.bvh;
+        let groups = groups(questions);
+        let mut blocked = vec![0; questions.weights.len().div_ceil(64)];
+        let (bvh, lights) = (stage.bvh, stage.lights);
+        let (groups, words) = (groups.as_slice(), blocked.as_mut_slice());
         if stage.count {
-            dispatch(stage.level, Trace { bvh, lights: stage.lights, questions, estimates, counter: counts });
+            dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter: counts });
         } else {
-            dispatch(
-                stage.level,
-                Trace { bvh, lights: stage.lights, questions, estimates, counter: &mut Uncounted },
-            );
+            let counter = &mut Uncounted;
+            dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter });
         }
+        estimates.clear();
+        let free = |i: usize| blocked[i / 64] >> (i % 64) & 1 == 0;
+        estimates.extend((0..questions.weights.len()).map(|i| if free(i) { 1.0 } else { 0.0 }));
     }
+}
+
+/// Points that share a shaft: one light, and places near each other.
+struct Group {
+    light: u32,
+    points: Vec<TilePoint>,
+}
+
+/// With as many samples a point and light or more, a tile is cut into parts of [`PART`] pixels: narrow shafts then
+/// save more than they cost.
+const FEW: usize = 4;
+const PART: u32 = 8;
+
+/// The batches of a tile by light and by part of the tile.
+fn groups(questions: &Questions) -> Vec<Group> {
+    let Questions { points, batches, width, .. } = questions;
+    let whole = questions.weights.len() < FEW * batches.len();
+    let part = |pixel: u32| {
+        let (x, y) = (pixel % width.max(&1), pixel / width.max(&1));
+        if whole { 0 } else { (y / PART) << 16 | x / PART }
+    };
+    let place = |batch: &super::Batch| (batch.light, part(points[batch.point as usize].pixel));
+    let mut order: Vec<_> = batches.iter().map(|batch| (place(batch), batch)).collect();
+    order.sort_by_key(|&(place, _)| place);
+    order
+        .chunk_by(|a, b| a.0 == b.0)
+        .map(|group| Group {
+            light: group[0].0.0,
+            points: group
+                .iter()
+                .map(|(_, batch)| TilePoint {
+                    x: points[batch.point as usize].origin.to_array(),
+                    first: batch.samples.start,
+                    count: batch.samples.end - batch.samples.start,
+                })
+                .collect(),
+        })
+        .collect()
 }
 
 /// All batches of a tile.
@@ -35,7 +76,8 @@ struct Trace<'a, C> {
     bvh: Bvh<'a>,
     lights: &'a [AreaLight],
     questions: &'a Questions,
-    estimates: &'a mut Vec<f32>,
+    groups: &'a [Group],
+    blocked: &'a mut [u64],
     counter: &'a mut C,
 }
 
@@ -46,26 +88,12 @@ impl<C: Counter> Task for Trace<'_, C> {
     fn run<S: Simd>(self, simd: S) {
         let bvh = self.bvh.on(simd);
         let [x, y, z] = &self.questions.targets;
-        let mut blocked = [0u64; MOST / 64];
-        let mut scratch = BatchScratch::new();
-        for batch in &self.questions.batches {
-            let point = &self.questions.points[batch.point as usize];
-            let samples = batch.samples.start as usize..batch.samples.end as usize;
-            for from in samples.clone().step_by(MOST) {
-                let part = from..samples.end.min(from + MOST);
-                let count = part.len();
-                if let Some(targets) = Targets::new(&x[part.clone()], &y[part.clone()], &z[part]) {
-                    let light = &self.lights[batch.light as usize];
-                    let targets = targets.on_parallelogram(light.corner, light.u, light.v);
-                    let scratch = &mut scratch;
-                    bvh.occluded_batch(point.origin, &targets, None, self.counter, scratch, &mut blocked);
-                    let free = |i: usize| blocked[i / 64] >> (i % 64) & 1 == 0;
-                    self.estimates.extend((0..count).map(|i| if free(i) { 1.0 } else { 0.0 }));
-                }
-            }
+        let Some(targets) = Targets::new(x, y, z) else { return };
+        let mut scratch = TileScratch::new();
+        for group in self.groups {
+            let light = &self.lights[group.light as usize];
+            let targets = targets.on_parallelogram(light.corner, light.u, light.v);
+            bvh.occluded_tile(&group.points, &targets, None, self.counter, &mut scratch, self.blocked);
         }
     }
 }
-
-/// Samples asked about at once.
-const MOST: usize = 256;

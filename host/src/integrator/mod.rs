@@ -4,8 +4,10 @@
 //! differ, gets all its questions at once: [`Visibility`] is what a method implements.
 
 mod exact;
+mod stochastic;
 
 pub use exact::Exact;
+pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
 use crate::film::{Tile, TileFilm};
 use crate::light::AreaLight;
@@ -71,6 +73,8 @@ pub struct ShadingPoint {
     pub triangle: u32,
     /// Diffuse reflectance.
     pub diffuse: Vec3,
+    /// The key of random numbers that are this point's own, for [`Sampler::from_key`].
+    pub key: u64,
 }
 
 /// The samples of one light as seen from one point.
@@ -95,6 +99,8 @@ pub struct Questions {
     pub targets: [Vec<f32>; 3],
     /// What each sample adds if it arrives, per unit of reflectance times radiance.
     pub weights: Vec<f32>,
+    /// Pixels across the tile.
+    pub width: u32,
 }
 
 impl Questions {
@@ -157,6 +163,7 @@ pub fn render_tile(
     let start = Instant::now();
     let tile = film.tile();
     scratch.questions.clear();
+    scratch.questions.width = tile.width;
     scratch.samplers.clear();
     scratch.radiance.clear();
     scratch.radiance.resize(tile.len(), Vec3::ZERO);
@@ -178,6 +185,7 @@ pub fn render_tile(
 /// What one pass over a tile asks: for benchmarks and tests of visibility alone.
 pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
     let mut scratch = Scratch { radiance: vec![Vec3::ZERO; tile.len()], ..Scratch::default() };
+    scratch.questions.width = tile.width;
     cast(stage, tile, width, pass, &mut scratch);
     sample_lights(stage, &mut scratch);
     scratch.questions
@@ -242,6 +250,7 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scra
                 normal,
                 triangle: hit.triangle,
                 diffuse: material.diffuse,
+                key: scratch.samplers[first + lane].key(),
             });
         }
     }
@@ -259,7 +268,7 @@ const FAIR_SHARE: f32 = 0.1;
 fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
     let Scratch { samplers, questions, shares, square, .. } = scratch;
     let clearance = stage.bvh.clearance();
-    let Questions { points, batches, targets, weights } = questions;
+    let Questions { points, batches, targets, weights, .. } = questions;
     for (index, point) in points.iter().enumerate() {
         let sampler = &mut samplers[point.pixel as usize];
         shares.clear();

@@ -1,8 +1,8 @@
 //! One point and many points on a light: which of the segments are blocked?
 
-use super::Bvh;
 use super::packet::{Any, Rays, Start};
 use super::pyramid::{Forgetful, Learn, Learner, MOST, Pyramid, Stack};
+use super::{Bvh, Part};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::vec3x;
@@ -156,16 +156,30 @@ impl<S: Simd> Bvh<'_, S> {
         scratch: &mut BatchScratch,
         blocked: &mut [u64],
     ) {
+        self.occluded_batch_among(x, targets, ignore, counter, scratch, blocked);
+    }
+
+    /// The same of the triangles of a part of the scene, as [`Bvh::occluded_among`] would answer.
+    #[inline(always)]
+    pub fn occluded_batch_among(
+        &self,
+        x: impl Into<[f32; 3]>,
+        targets: &Targets<'_>,
+        part: impl Part,
+        counter: &mut impl Counter,
+        scratch: &mut BatchScratch,
+        blocked: &mut [u64],
+    ) {
         let x = x.into();
         let mut from = 0;
         while from < targets.len() {
             let count = (targets.len() - from).min(MOST);
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
-                self.packets_from_root(x, targets, from, count, ignore, counter)
+                self.packets_from_root(x, targets, from, count, part, counter)
             } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
-                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, ignore, counter)
+                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, part, counter)
             } else {
-                self.packets_from_root(x, targets, from, count, ignore, counter)
+                self.packets_from_root(x, targets, from, count, part, counter)
             };
             from += MOST;
         }
@@ -179,11 +193,11 @@ impl<S: Simd> Bvh<'_, S> {
         targets: &Targets<'_>,
         first: usize,
         count: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
         let (start, ask) = (Start::ROOT, u64::MAX);
-        self.packets_blocked(&start, x, targets, first, count, ask, ignore, counter, &mut Forgetful)
+        self.packets_blocked(&start, x, targets, first, count, ask, part, counter, &mut Forgetful)
     }
 
     /// The same for those of `ask` of up to 64 targets, in packets.
@@ -197,7 +211,7 @@ impl<S: Simd> Bvh<'_, S> {
         first: usize,
         count: usize,
         ask: u64,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         learner: &mut impl Learner,
     ) -> u64 {
@@ -210,6 +224,7 @@ impl<S: Simd> Bvh<'_, S> {
             let (from, rest) = (first + done, (count - done).min(width));
             let active = (ask >> done) as u32 & ((1 << rest) - 1);
             if active != 0 {
+                counter.rays(active.count_ones());
                 let origin = vec3x::splat(token, x);
                 let ends = [
                     ends_of::<S>(token, targets.x, from, rest, &mut tail),
@@ -223,7 +238,7 @@ impl<S: Simd> Bvh<'_, S> {
                     t_max: S::Packet::splat(token, 1.0),
                 };
                 let mut any = Any { blocked: 0, note: Learn(learner) };
-                self.traverse_rays(start, &rays, active, ignore, counter, &mut any);
+                self.traverse_rays(start, &rays, active, part, counter, &mut any);
                 blocked |= u64::from(any.blocked) << done;
             }
             done += width;

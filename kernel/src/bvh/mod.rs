@@ -1,11 +1,16 @@
 //! A tree of boxes over triangles, eight children a node, and the questions asked of it.
 //!
-//! | question | one ray | up to 16 rays | one point, many light samples |
-//! |---|---|---|---|
-//! | is anything there? | [`Bvh::occluded`] | [`Bvh::occluded_packet`] | [`Bvh::occluded_batch`] |
-//! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | |
-//! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | |
-//! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | |
+//! | question | one ray | up to 16 rays | one point, many light samples | neighbouring points, one light |
+//! |---|---|---|---|---|
+//! | is anything there? | [`Bvh::occluded`] | [`Bvh::occluded_packet`] | [`Bvh::occluded_batch`] | [`Bvh::occluded_tile`] |
+//! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | | |
+//! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | | |
+//! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | | |
+//! | is any of these there? | [`Bvh::occluded_among`] | | [`Bvh::occluded_batch_among`] | |
+//!
+//! Which to use: for shadows, the tile wherever points come in neighbourhoods (about 8 by 8 pixels or texels at several
+//! samples a light, 16 by 16 at one); the batch for a point by itself with four samples or more; packets for other
+//! rays that start and end near each other, camera rays above all; single rays for the rest.
 //!
 //! Every one gives the answer of a loop over all triangles with the test of [`crate::triangle`]: boxes are
 //! widened by a bound on all rounding, of the box test as of the triangle test, so no hit is culled. One thing is
@@ -14,6 +19,7 @@
 
 mod batch;
 mod packet;
+mod part;
 mod pyramid;
 mod shaft;
 mod single;
@@ -22,10 +28,11 @@ mod tile;
 
 pub use batch::{BatchScratch, Targets};
 pub use packet::HitPacket;
+pub use part::Part;
 pub use tile::{TilePoint, TileScratch};
 
 use crate::lanes::{Native, Simd};
-use crate::triangle::{NO_TRIANGLE, TriangleBlock};
+use crate::triangle::TriangleBlock;
 use bytemuck::{Pod, Zeroable};
 use core::fmt;
 use glam::Vec3;
@@ -331,10 +338,4 @@ fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
         }
         path[level] = (child.index(), 0);
     }
-}
-
-/// Does a hit on this triangle count?
-#[inline(always)]
-fn counts(id: u32, ignore: Option<u32>) -> bool {
-    id != ignore.unwrap_or(NO_TRIANGLE)
 }

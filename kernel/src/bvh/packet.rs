@@ -1,7 +1,7 @@
 //! Several rays at a time, one a lane: one box or one triangle a step.
 
 use super::slabs::{PacketSlabs, SHORTEST, Slabs};
-use super::{Bvh, Child, Node, STACK, counts};
+use super::{Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::{Hit, RayPacket};
@@ -307,6 +307,7 @@ impl<S: Simd> Bvh<'_, S> {
         if active == 0 {
             return;
         }
+        counter.rays(active.count_ones());
         let chunk = Rays {
             origin: vec3x::load(token, &rays.origin, from),
             direction: vec3x::load(token, &rays.direction, from),
@@ -323,11 +324,10 @@ impl<S: Simd> Bvh<'_, S> {
         start: &Start<'_>,
         rays: &Rays<S::Packet>,
         active: u32,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
-        counter.rays(active.count_ones());
         if self.nodes.is_empty() {
             return;
         }
@@ -352,7 +352,7 @@ impl<S: Simd> Bvh<'_, S> {
         while axis < 3 {
             let active = [along_x, along_y, along_z][axis];
             if active != 0 {
-                self.traverse_packet(start, rays, &slabs, Axes::of(axis), active, ignore, counter, visitor);
+                self.traverse_packet(start, rays, &slabs, Axes::of(axis), active, part, counter, visitor);
             }
             axis += 1;
         }
@@ -367,7 +367,7 @@ impl<S: Simd> Bvh<'_, S> {
         slabs: &PacketSlabs<S::Packet>,
         axes: Axes,
         active: u32,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
@@ -381,7 +381,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut ends = Ends::NONE;
         let mut k = 0;
         while k < start.blocks.len() {
-            self.meet_block(&start.blocks[k], active, &mut this, ignore, counter, visitor);
+            self.meet_block(&start.blocks[k], active, &mut this, part, counter, visitor);
             if this.active == 0 {
                 return;
             }
@@ -398,7 +398,7 @@ impl<S: Simd> Bvh<'_, S> {
         }
         let mut k = 0;
         while k < start.nodes.len() {
-            self.meet_node::<V>(&start.nodes[k], this.active, slabs, &mut this, &mut stack, counter);
+            self.meet_node::<V>(&start.nodes[k], this.active, slabs, &mut this, &mut stack, part, counter);
             k += 1;
         }
         while let Some((next, meet, _)) = stack.pop() {
@@ -415,7 +415,7 @@ impl<S: Simd> Bvh<'_, S> {
                     let t_max = this.t_max[lane];
                     let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, lane, ends.t_min[lane]);
                     let sheared = ends.sheared(token, axes, lane, t_max);
-                    if let Some(place) = self.blocker_of(next, &slabs, &sheared, t_max, ignore, counter) {
+                    if let Some(place) = self.blocker_of(next, &slabs, &sheared, t_max, part, counter) {
                         this.active &= !visitor.hits(
                             1 << lane,
                             &self.blocks[place.block],
@@ -426,10 +426,10 @@ impl<S: Simd> Bvh<'_, S> {
                     }
                 }
             } else if next.is_leaf() {
-                self.meet_block(&self.blocks[next.index()], meet, &mut this, ignore, counter, visitor);
+                self.meet_block(&self.blocks[next.index()], meet, &mut this, part, counter, visitor);
             } else {
                 let node = &self.nodes[next.index()];
-                self.meet_node::<V>(node, meet, slabs, &mut this, &mut stack, counter);
+                self.meet_node::<V>(node, meet, slabs, &mut this, &mut stack, part, counter);
             }
             if this.active == 0 {
                 return;
@@ -443,7 +443,7 @@ impl<S: Simd> Bvh<'_, S> {
         block: &TriangleBlock,
         meet: u32,
         this: &mut Going<S::Packet>,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
@@ -453,6 +453,10 @@ impl<S: Simd> Bvh<'_, S> {
             let id = block.ids[lane];
             if id == crate::triangle::NO_TRIANGLE {
                 break;
+            }
+            if !part.holds(id) {
+                lane += 1;
+                continue;
             }
             counter.triangle_tests((meet & this.active).count_ones());
             let [a, b, c] = &block.vertices;
@@ -465,7 +469,7 @@ impl<S: Simd> Bvh<'_, S> {
             lane += 1;
             let crossing = this.sheared.cross(token, triangle);
             let bits = crossing.hit.bits() & meet & this.active;
-            if bits == 0 || !counts(id, ignore) {
+            if bits == 0 {
                 continue;
             }
             crossing.det.store(&mut this.found.det);
@@ -490,6 +494,7 @@ impl<S: Simd> Bvh<'_, S> {
         slabs: &PacketSlabs<S::Packet>,
         this: &mut Going<S::Packet>,
         stack: &mut ArrayVec<(Child, u32, f32), STACK>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) {
         let token = self.simd.token();
@@ -498,7 +503,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut place = 0;
         while place < Node::WIDTH {
             let child = node.children[place];
-            if child != Child::NONE {
+            if child != Child::NONE && part.below(child) {
                 let (hit, enter) = slabs.meet(token, node, place, this.sheared.t_max);
                 let meet = hit.bits() & meet;
                 if meet != 0 {

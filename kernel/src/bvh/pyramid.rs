@@ -19,7 +19,7 @@
 //! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by the same bound.
 
 use super::packet::{Any, Note, Rays, Start};
-use super::{Bvh, Child, Node, ROUNDING, STACK, Targets};
+use super::{Bvh, Child, Node, Part, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::Ray;
@@ -752,13 +752,13 @@ pub(super) fn greatest_of<L: Lanes>(v: L) -> f32 {
 }
 
 impl<S: Simd> Bvh<'_, S> {
-    /// Which of the pyramid's targets anything but `ignore` blocks.
+    /// Which of the pyramid's targets anything of the part blocks.
     #[inline(always)]
     pub(super) fn pyramid_blocked(
         &self,
         pyramid: &mut Pyramid,
         stack: &mut Stack,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
         let every = pyramid.every();
@@ -766,8 +766,8 @@ impl<S: Simd> Bvh<'_, S> {
         stack.clear();
         stack.push((Child::node(0), 0.0, every));
         let mut going = Going::new(every);
-        self.pyramid_goes_on(pyramid, stack, &mut going, ignore, counter, &mut Forgetful);
-        self.packets_go_on(pyramid, stack, &mut going, ignore, counter, &mut Forgetful);
+        self.pyramid_goes_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
+        self.packets_go_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
         every & !going.free
     }
 
@@ -779,7 +779,7 @@ impl<S: Simd> Bvh<'_, S> {
         pyramid: &mut Pyramid,
         stack: &mut Stack,
         going: &mut Going,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         learner: &mut impl Learner,
     ) {
@@ -800,19 +800,19 @@ impl<S: Simd> Bvh<'_, S> {
                         let i = rest.trailing_zeros() as usize;
                         rest &= rest - 1;
                         let sheared = shear_one(simd, &pyramid.ray(i), pyramid.axis(i));
-                        counter.triangle_tests(block.len() as u32);
+                        counter.triangle_tests(part.count(block));
                         let mut hits = sheared.cross_block(token, block, &mut found);
                         while hits != 0 {
                             let lane = hits.trailing_zeros() as usize & 7;
                             hits &= hits - 1;
-                            if super::counts(block.ids[lane], ignore) {
+                            if part.holds(block.ids[lane]) {
                                 going.free &= !(1 << i);
                             }
                         }
                     }
                 } else {
                     let blocked =
-                        self.block_blocked(pyramid, block, &mut going.forms, ask, ignore, counter, learner);
+                        self.block_blocked(pyramid, block, &mut going.forms, ask, part, counter, learner);
                     going.free &= !blocked;
                 }
             } else if ask.count_ones() <= LONE && going.visits > EASY {
@@ -821,12 +821,12 @@ impl<S: Simd> Bvh<'_, S> {
                     let i = rest.trailing_zeros() as usize;
                     rest &= rest - 1;
                     let (ray, axis) = (pyramid.ray(i), pyramid.axis(i));
-                    if self.blocker_below(next, &ray, axis, ignore, counter).is_some() {
+                    if self.blocker_below(next, &ray, axis, part, counter).is_some() {
                         going.free &= !(1 << i);
                     }
                 }
             } else {
-                self.push_children(pyramid, &self.nodes[next.index()], ask, stack, going, counter);
+                self.push_children(pyramid, &self.nodes[next.index()], ask, stack, going, part, counter);
             }
             if going.free == 0 {
                 return;
@@ -841,7 +841,7 @@ impl<S: Simd> Bvh<'_, S> {
         pyramid: &Pyramid,
         stack: &Stack,
         going: &mut Going,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         learner: &mut impl Learner,
     ) {
@@ -865,7 +865,7 @@ impl<S: Simd> Bvh<'_, S> {
                 };
                 let start = Start { root: false, blocks: &[], nodes: &[], entries: stack, shift };
                 let mut any = Any { blocked: 0, note: Learn(learner) };
-                self.traverse_rays(&start, &rays, ask, ignore, counter, &mut any);
+                self.traverse_rays(&start, &rays, ask, part, counter, &mut any);
                 going.free &= !(u64::from(any.blocked) << shift);
             }
             shift += S::Packet::WIDTH;
@@ -881,6 +881,7 @@ impl<S: Simd> Bvh<'_, S> {
         ask: u64,
         stack: &mut Stack,
         going: &mut Going,
+        part: impl Part,
         counter: &mut impl Counter,
     ) {
         let simd = self.simd;
@@ -901,7 +902,7 @@ impl<S: Simd> Bvh<'_, S> {
             let place = met.trailing_zeros() as usize & 7;
             met &= met - 1;
             let (child, at, may) = (node.children[place], depth[place], hides[place] & ask);
-            if may == 0 || child == Child::NONE {
+            if may == 0 || child == Child::NONE || !part.below(child) {
                 continue;
             }
             // Depth is checked at construction, so there is always room.
@@ -924,7 +925,7 @@ impl<S: Simd> Bvh<'_, S> {
         block: &TriangleBlock,
         forms: &mut Forms,
         ask: u64,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         learner: &mut impl Learner,
     ) -> u64 {
@@ -936,7 +937,7 @@ impl<S: Simd> Bvh<'_, S> {
             let lane = open.trailing_zeros() as usize & 7;
             open &= open - 1;
             let id = block.ids[lane];
-            if id == crate::triangle::NO_TRIANGLE || !super::counts(id, ignore) {
+            if id == crate::triangle::NO_TRIANGLE || !part.holds(id) {
                 continue;
             }
             if verdict.all >> lane & 1 != 0 {

@@ -1,7 +1,7 @@
 //! One ray at a time: eight boxes or eight triangles a step.
 
 use super::slabs::{SHORTEST, Slabs};
-use super::{Bvh, Child, MAX_DEPTH, Node, STACK, counts};
+use super::{Bvh, Child, MAX_DEPTH, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::Simd;
 use crate::ray::{Hit, Ray};
@@ -145,6 +145,14 @@ impl<S: Simd> Bvh<'_, S> {
         visitor.found
     }
 
+    /// Does any triangle of this part of the scene block the ray?
+    #[inline(always)]
+    pub fn occluded_among(&self, ray: &Ray, part: impl Part, counter: &mut impl Counter) -> bool {
+        let mut visitor = First { t_max: ray.t_max, found: None };
+        self.traverse(ray, part, counter, &mut visitor);
+        visitor.found.is_some()
+    }
+
     /// The nearest hit. Of several at the same `t`, that of the lowest number.
     #[inline(always)]
     pub fn closest(&self, ray: &Ray, ignore: Option<u32>, counter: &mut impl Counter) -> Option<Hit> {
@@ -194,13 +202,7 @@ impl<S: Simd> Bvh<'_, S> {
     }
 
     #[inline(always)]
-    fn traverse<V: Visitor>(
-        &self,
-        ray: &Ray,
-        ignore: Option<u32>,
-        counter: &mut impl Counter,
-        visitor: &mut V,
-    ) {
+    fn traverse<V: Visitor>(&self, ray: &Ray, part: impl Part, counter: &mut impl Counter, visitor: &mut V) {
         counter.rays(1);
         let (Some(axis), false) = (dominant_axis(ray.origin, ray.direction), self.nodes.is_empty()) else {
             return;
@@ -208,22 +210,22 @@ impl<S: Simd> Bvh<'_, S> {
         if ray.direction.abs().max_element() < SHORTEST {
             return;
         }
-        self.traverse_below(Child::node(0), ray, axis, ignore, counter, visitor);
+        self.traverse_below(Child::node(0), ray, axis, part, counter, visitor);
     }
 
-    /// Which triangle but `ignore` in this subtree blocks a ray that can hit something, if any does?
+    /// Which triangle of the part in this subtree blocks a ray that can hit something, if any does?
     #[inline(always)]
     pub(super) fn blocker_below(
         &self,
         subtree: Child,
         ray: &Ray,
         axis: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> Option<Place> {
         let slabs = Slabs::<S::Node>::new(self.simd.token(), ray, self.slack(ray.origin));
         let sheared = shear_one(self.simd, ray, axis);
-        self.blocker_of(subtree, &slabs, &sheared, ray.t_max, ignore, counter)
+        self.blocker_of(subtree, &slabs, &sheared, ray.t_max, part, counter)
     }
 
     /// The same for a ray made ready.
@@ -234,10 +236,10 @@ impl<S: Simd> Bvh<'_, S> {
         slabs: &Slabs<S::Node>,
         sheared: &Sheared<S::Node>,
         t_max: f32,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> Option<Place> {
-        self.traverse_in_no_order(subtree, slabs, sheared, ignore, counter, &mut First { t_max, found: None })
+        self.traverse_in_no_order(subtree, slabs, sheared, part, counter, &mut First { t_max, found: None })
     }
 
     #[inline(always)]
@@ -246,16 +248,16 @@ impl<S: Simd> Bvh<'_, S> {
         subtree: Child,
         ray: &Ray,
         axis: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
         if V::ORDERED {
-            self.traverse_in_order(subtree, ray, axis, ignore, counter, visitor);
+            self.traverse_in_order(subtree, ray, axis, part, counter, visitor);
         } else {
             let slabs = Slabs::<S::Node>::new(self.simd.token(), ray, self.slack(ray.origin));
             let sheared = shear_one(self.simd, ray, axis);
-            self.traverse_in_no_order(subtree, &slabs, &sheared, ignore, counter, visitor);
+            self.traverse_in_no_order(subtree, &slabs, &sheared, part, counter, visitor);
         }
     }
 
@@ -267,7 +269,7 @@ impl<S: Simd> Bvh<'_, S> {
         subtree: Child,
         slabs: &Slabs<S::Node>,
         sheared: &Sheared<S::Node>,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) -> Option<Place> {
@@ -280,13 +282,13 @@ impl<S: Simd> Bvh<'_, S> {
         loop {
             if next.is_leaf() {
                 let block = &self.blocks[next.index()];
-                counter.triangle_tests(block.len() as u32);
+                counter.triangle_tests(part.count(block));
                 let mut hits = sheared.cross_block(token, block, &mut found);
                 while hits != 0 {
                     let lane = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;
                     let id = block.ids[lane];
-                    if counts(id, ignore) && visitor.hit(id, || found.hit(lane, id)).is_break() {
+                    if part.holds(id) && visitor.hit(id, || found.hit(lane, id)).is_break() {
                         return Some(Place { block: next.index(), lane });
                     }
                 }
@@ -310,7 +312,7 @@ impl<S: Simd> Bvh<'_, S> {
                 levels[level - 1].1 = left & (left - 1);
                 let child = self.nodes[node as usize].children[left.trailing_zeros() as usize & 7];
                 // Its box is empty, or was never looked at: nothing promises that no ray meets it.
-                if child != Child::NONE {
+                if child != Child::NONE && part.below(child) {
                     break child;
                 }
             };
@@ -324,7 +326,7 @@ impl<S: Simd> Bvh<'_, S> {
         subtree: Child,
         ray: &Ray,
         axis: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
@@ -338,13 +340,13 @@ impl<S: Simd> Bvh<'_, S> {
         loop {
             if next.is_leaf() {
                 let block = &self.blocks[next.index()];
-                counter.triangle_tests(block.len() as u32);
+                counter.triangle_tests(part.count(block));
                 let mut hits = sheared.cross_block(token, block, &mut found);
                 while hits != 0 {
                     let lane = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;
                     let id = block.ids[lane];
-                    if counts(id, ignore) && visitor.hit(id, || found.hit(lane, id)).is_break() {
+                    if part.holds(id) && visitor.hit(id, || found.hit(lane, id)).is_break() {
                         return;
                     }
                 }
@@ -357,7 +359,7 @@ impl<S: Simd> Bvh<'_, S> {
                     let place = met.trailing_zeros() as usize & 7;
                     met &= met - 1;
                     let (child, at) = (node.children[place], entry[place]);
-                    if child == Child::NONE {
+                    if child == Child::NONE || !part.below(child) {
                         continue;
                     }
                     // Farthest first, so that the nearest is on top. Depth is checked at construction, so there

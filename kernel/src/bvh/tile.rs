@@ -225,6 +225,9 @@ impl Packet {
     const EMPTY: Self = Self { origin: [[0.0; 16]; 3], direction: [[0.0; 16]; 3], target: [0; 16], count: 0 };
 }
 
+/// With fewer rays a shaft costs more than it saves.
+const WORTHWHILE: usize = 32;
+
 /// Steps a shaft may take for each ray of its tile, and at most.
 const STEPS: [usize; 3] = [16, 8, 192];
 
@@ -259,7 +262,7 @@ impl<S: Simd> Bvh<'_, S> {
             counter.rays(rays as u32);
             return;
         }
-        let shaft = self.shaft(points, targets);
+        let shaft = if rays < WORTHWHILE { None } else { self.shaft(points, targets) };
         let TileScratch { batch, cut, given, learned, packet } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
@@ -372,6 +375,7 @@ impl<S: Simd> Bvh<'_, S> {
             t_max: S::Packet::splat(token, 1.0),
         };
         let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[], shift: 0 };
+        counter.rays(packet.count as u32);
         let mut any = Any { blocked: 0, note: Nobody };
         self.traverse_rays(&start, &rays, (1 << packet.count) - 1, ignore, counter, &mut any);
         let mut bits = any.blocked;

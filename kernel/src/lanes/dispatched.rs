@@ -51,15 +51,49 @@ pub trait Task {
 /// Runs a task with the vectors of a level. Costs a branch: enter once for a tile of work, not once a ray.
 #[inline]
 pub fn dispatch<T: Task>(level: Level, task: T) -> T::Output {
-    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
-    if let Some(token) = level.as_avx512() {
-        return fearless_simd::Simd::vectorize(
-            token,
-            #[inline(always)]
-            || task.run(Dispatched16(token)),
-        );
+    // Not the macro of `fearless_simd`: it would compile the task for AVX-512 a second time, in eight lanes.
+    #[cfg(target_arch = "x86_64")]
+    {
+        if let Some(token) = level.as_avx512() {
+            return vectorize(token, task, Dispatched16(token));
+        }
+        if let Some(token) = level.as_avx2() {
+            return vectorize(token, task, Dispatched(token));
+        }
+        if let Some(token) = level.as_sse4_2() {
+            return vectorize(token, task, Dispatched(token));
+        }
+        if let Some(token) = level.as_sse2() {
+            return vectorize(token, task, Dispatched(token));
+        }
     }
+    #[cfg(target_arch = "x86")]
+    if let Some(token) = level.as_avx512() {
+        return vectorize(token, task, Dispatched16(token));
+    }
+    dispatch_rest(level, task)
+}
+
+/// Levels of other machines. No x86-64 comes here, where SSE2 is always there.
+#[cfg(target_arch = "x86_64")]
+fn dispatch_rest<T: Task>(_: Level, task: T) -> T::Output {
+    task.run(super::Scalar)
+}
+
+#[cfg(not(target_arch = "x86_64"))]
+#[inline]
+fn dispatch_rest<T: Task>(level: Level, task: T) -> T::Output {
     fearless_simd::dispatch!(level, token => task.run(Dispatched(token)))
+}
+
+#[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+#[inline]
+fn vectorize<F: fearless_simd::Simd, T: Task>(token: F, task: T, simd: impl Simd) -> T::Output {
+    fearless_simd::Simd::vectorize(
+        token,
+        #[inline(always)]
+        || task.run(simd),
+    )
 }
 
 /// The best level of this CPU (with the feature `std`), or of the target this was compiled for.
