@@ -31,6 +31,19 @@ impl Sampler {
         Self(Xoshiro128PlusPlus::seed_from_u64(mix(mixed)))
     }
 
+    /// A generator of its own for each key.
+    #[inline]
+    pub fn from_key(key: u64) -> Self {
+        Self(Xoshiro128PlusPlus::seed_from_u64(mix(key ^ 0xbb67_ae85_84ca_a73b)))
+    }
+
+    /// The key of another generator. Takes no number from this one.
+    #[inline]
+    pub fn key(&self) -> u64 {
+        let mut copy = self.0.clone();
+        u64::from(copy.next_u32()) << 32 | u64::from(copy.next_u32())
+    }
+
     /// Where in its pixel a camera sample lies: passes together form a scrambled (0, 2)-sequence over the square.
     ///
     /// Each alone is uniform. Their spread makes the mean of a pixel at an edge converge faster than the variance

@@ -34,7 +34,7 @@ pub mod ray;
 pub mod triangle;
 mod vec3x;
 
-pub use bvh::{BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Targets, offset};
+pub use bvh::{BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Part, Targets, offset};
 pub use counter::{Counter, Counts, Uncounted};
 pub use decomposition::{Costs, Decomposition, EstimatorError, Group, Joint, Need, Needs, Tally};
 pub use estimator::{Estimator, Exact, Halving, Levels, OneTerm, Probabilities, Quotas};

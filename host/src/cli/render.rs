@@ -3,15 +3,16 @@
 use super::{Ended, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
-use crate::integrator::{Exact, Stage, Visibility};
+use crate::integrator::{Exact, Form, Rule, Settings, Split, Stage, Stochastic, Visibility};
 use crate::render::{Limits, render};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
 use crate::sampler::Pattern;
-use crate::scene::CameraRequest;
+use crate::scene::{CameraRequest, Scene};
 use crate::{light, metrics, output, scene};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use indicatif::{ProgressBar, ProgressStyle};
+use occlude_kernel::Bvh;
 use occlude_kernel::lanes::{Level, level_name};
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -79,7 +80,62 @@ pub struct RenderArgs {
     quiet: bool,
 
     #[command(flatten)]
+    stochastic: StochasticArgs,
+
+    #[command(flatten)]
     camera: CameraArgs,
+}
+
+/// The options of `--method stochastic`.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "With --method stochastic")]
+struct StochasticArgs {
+    /// The sum that the visibility of two groups of blockers is written as: inclusion, balanced, power:N (like power:8)
+    /// or residual [default: balanced].
+    #[arg(long, value_name = "FORM")]
+    decomposition: Option<Form>,
+
+    /// Where the probabilities of its terms come from [default: uniform].
+    #[arg(long, value_enum, value_name = "RULE")]
+    probabilities: Option<Rule>,
+
+    /// How blockers are divided into groups [default: random].
+    #[arg(long, value_enum)]
+    split: Option<Split>,
+
+    /// How many groups; more than 2 with --decomposition residual, which asks the later ones the more rarely
+    /// [default: 2].
+    #[arg(long, value_name = "K")]
+    levels: Option<usize>,
+
+    /// Of the shadow rays of a point and light, exactly the right share takes each term.
+    #[arg(long)]
+    quotas: bool,
+}
+
+impl StochasticArgs {
+    /// The first option that was given.
+    fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.decomposition.is_some(), "--decomposition"),
+            (self.probabilities.is_some(), "--probabilities"),
+            (self.split.is_some(), "--split"),
+            (self.levels.is_some(), "--levels"),
+            (self.quotas, "--quotas"),
+        ];
+        given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
+    }
+
+    fn settings(&self) -> Result<Settings> {
+        Settings {
+            form: self.decomposition.unwrap_or_default(),
+            rule: self.probabilities.unwrap_or_default(),
+            split: self.split.unwrap_or_default(),
+            groups: self.levels.unwrap_or(2),
+            quotas: self.quotas,
+        }
+        .checked()
+    }
 }
 
 /// The camera's options, which `info` and `render` share.
@@ -131,13 +187,39 @@ enum Method {
     /// Every shadow ray is traced through the scene.
     #[default]
     Exact,
+    /// A random part of the blockers is asked, by a sum over two groups of them: right on average, noisier.
+    Stochastic,
 }
 
-impl Method {
-    fn visibility(self) -> Box<dyn Visibility> {
-        match self {
-            Self::Exact => Box::new(Exact),
+/// What `--method` and its options ask for.
+enum Chosen {
+    Exact,
+    Stochastic(Settings),
+}
+
+impl Chosen {
+    fn from(args: &RenderArgs) -> Result<Self> {
+        match (args.method, args.stochastic.given()) {
+            (Method::Exact, None) => Ok(Self::Exact),
+            (Method::Exact, Some(option)) => {
+                Err(Error::Usage(format!("{option} is an option of --method stochastic")))
+            }
+            (Method::Stochastic, _) => args.stochastic.settings().map(Self::Stochastic),
         }
+    }
+
+    fn name(&self) -> String {
+        match self {
+            Self::Exact => "exact".to_owned(),
+            Self::Stochastic(settings) => format!("stochastic {settings}"),
+        }
+    }
+
+    fn visibility(&self, scene: &Scene, bvh: &Bvh<'_>) -> Result<Box<dyn Visibility>> {
+        Ok(match self {
+            Self::Exact => Box::new(Exact),
+            Self::Stochastic(settings) => Box::new(Stochastic::new(*settings, scene, bvh)?),
+        })
     }
 }
 
@@ -167,6 +249,7 @@ fn size(text: &str) -> std::result::Result<(u32, u32), String> {
 
 /// Runs the command.
 pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
+    let chosen = Chosen::from(args)?;
     for path in &args.output {
         output::check_writable(path)?;
     }
@@ -204,6 +287,9 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let start = Instant::now();
     let accel = Accel::build(&scene, args.quality);
     let build = start.elapsed();
+    let start = Instant::now();
+    let method = chosen.visibility(&scene, &accel.bvh())?;
+    let preprocess = start.elapsed();
     let lights = light::lights(&scene);
     let frame = camera.frame();
     let stage = Stage {
@@ -233,7 +319,6 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
 
     let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
     let limits = Limits { passes: args.spp, time: args.time_limit };
-    let method = args.method.visibility();
     let rendered = render(&stage, &*method, size, limits, args.threads, &stop, |pass| progress.passed(pass))?;
     progress.finish();
 
@@ -249,7 +334,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let seconds = |time: Duration| time.as_secs_f64();
     let report = Report {
         scene: scene.name.clone(),
-        method: args.method.to_possible_value().map(|v| v.get_name().to_owned()).unwrap_or_default(),
+        method: chosen.name(),
         size: [size.0, size.1],
         spp: rendered.passes,
         shadow_rays: args.shadow_rays,
@@ -260,7 +345,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         time: Times {
             load_s: seconds(load),
             build_s: seconds(build),
-            preprocess_s: 0.0,
+            preprocess_s: seconds(preprocess),
             render_s: seconds(rendered.elapsed),
             camera_s: seconds(rendered.times.camera),
             light_s: seconds(rendered.times.light),

@@ -4,8 +4,10 @@
 //! differ, gets all its questions at once: [`Visibility`] is what a method implements.
 
 mod exact;
+mod stochastic;
 
 pub use exact::Exact;
+pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
 use crate::film::{Tile, TileFilm};
 use crate::light::AreaLight;
@@ -71,6 +73,8 @@ pub struct ShadingPoint {
     pub triangle: u32,
     /// Diffuse reflectance.
     pub diffuse: Vec3,
+    /// The key of random numbers that are this point's own, for [`Sampler::from_key`].
+    pub key: u64,
 }
 
 /// The samples of one light as seen from one point.
@@ -242,6 +246,7 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scra
                 normal,
                 triangle: hit.triangle,
                 diffuse: material.diffuse,
+                key: scratch.samplers[first + lane].key(),
             });
         }
     }

@@ -1,8 +1,8 @@
 //! One point and many points on a light: which of the segments are blocked?
 
-use super::Bvh;
 use super::packet::{Any, Rays};
 use super::pyramid::{MOST, NO_STACK, Pyramid, Stack};
+use super::{Bvh, Part};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::vec3x;
@@ -147,16 +147,30 @@ impl<S: Simd> Bvh<'_, S> {
         scratch: &mut BatchScratch,
         blocked: &mut [u64],
     ) {
+        self.occluded_batch_among(x, targets, ignore, counter, scratch, blocked);
+    }
+
+    /// The same of the triangles of a part of the scene, as [`Bvh::occluded_among`] would answer.
+    #[inline(always)]
+    pub fn occluded_batch_among(
+        &self,
+        x: impl Into<[f32; 3]>,
+        targets: &Targets<'_>,
+        part: impl Part,
+        counter: &mut impl Counter,
+        scratch: &mut BatchScratch,
+        blocked: &mut [u64],
+    ) {
         let x = x.into();
         let mut from = 0;
         while from < targets.len() {
             let count = (targets.len() - from).min(MOST);
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
-                self.packets_blocked(x, targets, from, count, ignore, counter)
+                self.packets_blocked(x, targets, from, count, part, counter)
             } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
-                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, ignore, counter)
+                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, part, counter)
             } else {
-                self.packets_blocked(x, targets, from, count, ignore, counter)
+                self.packets_blocked(x, targets, from, count, part, counter)
             };
             from += MOST;
         }
@@ -170,7 +184,7 @@ impl<S: Simd> Bvh<'_, S> {
         targets: &Targets<'_>,
         first: usize,
         count: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
         let token = self.simd.token();
@@ -193,7 +207,7 @@ impl<S: Simd> Bvh<'_, S> {
                 t_max: S::Packet::splat(token, 1.0),
             };
             let mut any = Any { blocked: 0, note: |_, _| () };
-            self.traverse_rays(&rays, (1 << rest) - 1, ignore, counter, &mut any);
+            self.traverse_rays(&rays, (1 << rest) - 1, part, counter, &mut any);
             blocked |= u64::from(any.blocked) << done;
             done += width;
         }

@@ -6,6 +6,7 @@
 //! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | |
 //! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | |
 //! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | |
+//! | is any of these there? | [`Bvh::occluded_among`] | | [`Bvh::occluded_batch_among`] |
 //!
 //! Every one gives the answer of a loop over all triangles with the test of [`crate::triangle`]: boxes are
 //! widened by a bound on all rounding, of the box test as of the triangle test, so no hit is culled. One thing is
@@ -14,15 +15,17 @@
 
 mod batch;
 mod packet;
+mod part;
 mod pyramid;
 mod single;
 mod slabs;
 
 pub use batch::{BatchScratch, Targets};
 pub use packet::HitPacket;
+pub use part::Part;
 
 use crate::lanes::{Native, Simd};
-use crate::triangle::{NO_TRIANGLE, TriangleBlock};
+use crate::triangle::TriangleBlock;
 use bytemuck::{Pod, Zeroable};
 use core::fmt;
 use glam::Vec3;
@@ -325,10 +328,4 @@ fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
         }
         path[level] = (child.index(), 0);
     }
-}
-
-/// Does a hit on this triangle count?
-#[inline(always)]
-fn counts(id: u32, ignore: Option<u32>) -> bool {
-    id != ignore.unwrap_or(NO_TRIANGLE)
 }

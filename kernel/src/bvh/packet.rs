@@ -1,7 +1,7 @@
 //! Several rays at a time, one a lane: one box or one triangle a step.
 
 use super::slabs::{PacketSlabs, SHORTEST};
-use super::{Bvh, Child, Node, STACK, counts};
+use super::{Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::{Hit, RayPacket};
@@ -206,7 +206,7 @@ impl<S: Simd> Bvh<'_, S> {
         &self,
         rays: &Rays<S::Packet>,
         active: u32,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
@@ -235,7 +235,7 @@ impl<S: Simd> Bvh<'_, S> {
         while axis < 3 {
             let active = [along_x, along_y, along_z][axis];
             if active != 0 {
-                self.traverse_packet(rays, &slabs, Axes::of(axis), active, ignore, counter, visitor);
+                self.traverse_packet(rays, &slabs, Axes::of(axis), active, part, counter, visitor);
             }
             axis += 1;
         }
@@ -249,7 +249,7 @@ impl<S: Simd> Bvh<'_, S> {
         slabs: &PacketSlabs<S::Packet>,
         axes: Axes,
         mut active: u32,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
@@ -276,6 +276,9 @@ impl<S: Simd> Bvh<'_, S> {
                     if id == crate::triangle::NO_TRIANGLE {
                         break;
                     }
+                    if !part.holds(id) {
+                        continue;
+                    }
                     counter.triangle_tests((meet & active).count_ones());
                     let [a, b, c] = &block.vertices;
                     let triangle = [
@@ -285,7 +288,7 @@ impl<S: Simd> Bvh<'_, S> {
                     ];
                     let crossing = sheared.cross(token, triangle);
                     let bits = crossing.hit.bits() & meet & active;
-                    if bits == 0 || !counts(id, ignore) {
+                    if bits == 0 {
                         continue;
                     }
                     crossing.det.store(&mut found.det);
@@ -307,7 +310,7 @@ impl<S: Simd> Bvh<'_, S> {
                 let mut entry = [0.0; 16];
                 for place in 0..Node::WIDTH {
                     let child = node.children[place];
-                    if child == Child::NONE {
+                    if child == Child::NONE || !part.below(child) {
                         continue;
                     }
                     let (hit, enter) = slabs.meet(token, node, place, sheared.t_max);

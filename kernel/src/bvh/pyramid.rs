@@ -18,7 +18,7 @@
 //!
 //! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by the same bound.
 
-use super::{Bvh, Child, Node, ROUNDING, STACK, Targets};
+use super::{Bvh, Child, Node, Part, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::Ray;
@@ -730,13 +730,13 @@ fn greatest_of<L: Lanes>(v: L) -> f32 {
 }
 
 impl<S: Simd> Bvh<'_, S> {
-    /// Which of the pyramid's targets anything but `ignore` blocks.
+    /// Which of the pyramid's targets anything of the part blocks.
     #[inline(always)]
     pub(super) fn pyramid_blocked(
         &self,
         pyramid: &mut Pyramid,
         stack: &mut Stack,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
         let simd = self.simd;
@@ -768,18 +768,18 @@ impl<S: Simd> Bvh<'_, S> {
                         let i = rest.trailing_zeros() as usize;
                         rest &= rest - 1;
                         let sheared = shear_one(simd, &pyramid.ray(i), pyramid.axis(i));
-                        counter.triangle_tests(block.len() as u32);
+                        counter.triangle_tests(part.count(block));
                         let mut hits = sheared.cross_block(token, block, &mut found);
                         while hits != 0 {
                             let lane = hits.trailing_zeros() as usize & 7;
                             hits &= hits - 1;
-                            if super::counts(block.ids[lane], ignore) {
+                            if part.holds(block.ids[lane]) {
                                 free &= !(1 << i);
                             }
                         }
                     }
                 } else {
-                    free &= !self.block_blocked(pyramid, block, &mut forms, ask, ignore, counter);
+                    free &= !self.block_blocked(pyramid, block, &mut forms, ask, part, counter);
                 }
                 if free == 0 {
                     return every;
@@ -789,7 +789,7 @@ impl<S: Simd> Bvh<'_, S> {
                 while rest != 0 {
                     let i = rest.trailing_zeros() as usize;
                     rest &= rest - 1;
-                    if self.occluded_below(next, &pyramid.ray(i), pyramid.axis(i), ignore, counter) {
+                    if self.occluded_below(next, &pyramid.ray(i), pyramid.axis(i), part, counter) {
                         free &= !(1 << i);
                     }
                 }
@@ -813,7 +813,7 @@ impl<S: Simd> Bvh<'_, S> {
                     let place = met.trailing_zeros() as usize & 7;
                     met &= met - 1;
                     let (child, at, may) = (node.children[place], depth[place], hides[place] & ask);
-                    if may == 0 || child == Child::NONE {
+                    if may == 0 || child == Child::NONE || !part.below(child) {
                         continue;
                     }
                     let mut slot = len;
@@ -841,7 +841,7 @@ impl<S: Simd> Bvh<'_, S> {
         block: &TriangleBlock,
         forms: &mut Forms,
         ask: u64,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
         let simd = self.simd;
@@ -852,7 +852,7 @@ impl<S: Simd> Bvh<'_, S> {
             let lane = open.trailing_zeros() as usize & 7;
             open &= open - 1;
             let id = block.ids[lane];
-            if id == crate::triangle::NO_TRIANGLE || !super::counts(id, ignore) {
+            if id == crate::triangle::NO_TRIANGLE || !part.holds(id) {
                 continue;
             }
             if verdict.all >> lane & 1 != 0 {

@@ -1,7 +1,7 @@
 //! One ray at a time: eight boxes or eight triangles a step.
 
 use super::slabs::{SHORTEST, Slabs};
-use super::{Bvh, Child, Node, STACK, counts};
+use super::{Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::Simd;
 use crate::ray::{Hit, Ray};
@@ -137,6 +137,14 @@ impl<S: Simd> Bvh<'_, S> {
         visitor.found
     }
 
+    /// Does any triangle of this part of the scene block the ray?
+    #[inline(always)]
+    pub fn occluded_among(&self, ray: &Ray, part: impl Part, counter: &mut impl Counter) -> bool {
+        let mut visitor = First { t_max: ray.t_max, found: None };
+        self.traverse(ray, part, counter, &mut visitor);
+        visitor.found.is_some()
+    }
+
     /// The nearest hit. Of several at the same `t`, that of the lowest number.
     #[inline(always)]
     pub fn closest(&self, ray: &Ray, ignore: Option<u32>, counter: &mut impl Counter) -> Option<Hit> {
@@ -186,13 +194,7 @@ impl<S: Simd> Bvh<'_, S> {
     }
 
     #[inline(always)]
-    fn traverse<V: Visitor>(
-        &self,
-        ray: &Ray,
-        ignore: Option<u32>,
-        counter: &mut impl Counter,
-        visitor: &mut V,
-    ) {
+    fn traverse<V: Visitor>(&self, ray: &Ray, part: impl Part, counter: &mut impl Counter, visitor: &mut V) {
         counter.rays(1);
         let (Some(axis), false) = (dominant_axis(ray.origin, ray.direction), self.nodes.is_empty()) else {
             return;
@@ -200,21 +202,21 @@ impl<S: Simd> Bvh<'_, S> {
         if ray.direction.abs().max_element() < SHORTEST {
             return;
         }
-        self.traverse_below(Child::node(0), ray, axis, ignore, counter, visitor);
+        self.traverse_below(Child::node(0), ray, axis, part, counter, visitor);
     }
 
-    /// Does anything but `ignore` in this subtree block a ray that can hit something?
+    /// Does anything of the part in this subtree block a ray that can hit something?
     #[inline(always)]
     pub(super) fn occluded_below(
         &self,
         subtree: Child,
         ray: &Ray,
         axis: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
     ) -> bool {
         let mut visitor = First { t_max: ray.t_max, found: None };
-        self.traverse_below(subtree, ray, axis, ignore, counter, &mut visitor);
+        self.traverse_below(subtree, ray, axis, part, counter, &mut visitor);
         visitor.found.is_some()
     }
 
@@ -224,7 +226,7 @@ impl<S: Simd> Bvh<'_, S> {
         subtree: Child,
         ray: &Ray,
         axis: usize,
-        ignore: Option<u32>,
+        part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
@@ -242,13 +244,13 @@ impl<S: Simd> Bvh<'_, S> {
         loop {
             if next.is_leaf() {
                 let block = &self.blocks[next.index()];
-                counter.triangle_tests(block.len() as u32);
+                counter.triangle_tests(part.count(block));
                 let mut hits = sheared.cross_block(token, block, &mut found);
                 while hits != 0 {
                     let lane = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;
                     let id = block.ids[lane];
-                    if counts(id, ignore) && visitor.hit(id, || found.hit(lane, id)).is_break() {
+                    if part.holds(id) && visitor.hit(id, || found.hit(lane, id)).is_break() {
                         return;
                     }
                 }
@@ -262,7 +264,7 @@ impl<S: Simd> Bvh<'_, S> {
                     met &= met - 1;
                     let (child, at) = (node.children[place], entry[place]);
                     // Its box is empty, or was never looked at: nothing promises that no ray meets it.
-                    if child == Child::NONE {
+                    if child == Child::NONE || !part.below(child) {
                         continue;
                     }
                     let mut slot = len;
