@@ -13,6 +13,7 @@ pub mod output;
 pub mod page;
 pub mod render;
 pub mod report;
+pub mod reproduce;
 pub mod sampler;
 pub mod scene;
 

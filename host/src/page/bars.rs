@@ -50,7 +50,7 @@ impl Part for Bars {
         let layout = self.axis.layout(bars().flat_map(|bar| [bar.value, bar.value + bar.error]));
         html.raw("<figure>");
         html.caption(&self.title, &self.words);
-        html.raw("<div class=\"plots\">");
+        html.raw("<div class=\"plots bars\">");
         for (name, bars) in &self.groups {
             html.raw(&format!("<div><h4>{}</h4>", marked(name)));
             let bottom = 4.0 + bars.len() as f64 * BAR;

@@ -69,6 +69,7 @@ pub struct Page {
     maker: String,
     title: String,
     lead: String,
+    short: Vec<String>,
     sections: Vec<String>,
     body: Html,
 }
@@ -77,7 +78,7 @@ impl Page {
     /// An empty page by `maker`, the command that writes it, by which [`Folder`] knows it again.
     pub fn new(maker: impl Into<String>, title: impl Into<String>, lead: impl Into<String>) -> Self {
         let (maker, title, lead) = (maker.into(), title.into(), lead.into());
-        Self { maker, title, lead, sections: Vec::new(), body: Html::default() }
+        Self { maker, title, lead, short: Vec::new(), sections: Vec::new(), body: Html::default() }
     }
 
     /// Begins a section, which the list of contents shall name.
@@ -86,6 +87,11 @@ impl Page {
         self.sections.push(title.to_owned());
         let number = self.sections.len();
         self.body.raw(&format!("{close}<section id=\"s{number}\"><h2>{number}. {}</h2>\n", marked(title)));
+    }
+
+    /// Adds a line to what the page says at its very beginning.
+    pub fn in_short(&mut self, text: impl Into<String>) {
+        self.short.push(text.into());
     }
 
     /// Begins a part of a section.
@@ -149,6 +155,11 @@ impl Page {
             marked(&self.title),
             marked(&self.lead)
         );
+        if !self.short.is_empty() {
+            html += "<ul class=\"plain\">";
+            self.short.iter().for_each(|line| html += &format!("<li>{}</li>", marked(line)));
+            html += "</ul>\n";
+        }
         if self.sections.len() > 1 {
             html += "<nav aria-label=\"Contents\"><ol>";
             for (i, section) in self.sections.iter().enumerate() {
@@ -213,6 +224,7 @@ pub(crate) mod tests {
     #[test]
     fn a_page_of_everything_is_well_formed() {
         let mut page = Page::new("occlude <test>", "A & B", "V_{A} < 1");
+        page.in_short("first & foremost");
         page.prose("before any section");
         page.section("First <section>");
         page.heading("Heading & more");
@@ -267,7 +279,7 @@ pub(crate) mod tests {
         let series = Series::new("one", 1, [(1.0, 1.0), (10.0, 10.0), (100.0, 100.0), (0.0, 1.0)]);
         Figure::new("", "").plot(Plot::new("", axes(), axes()).series(series)).html(&mut html);
         let (markup, text) = parsed(&html);
-        assert!(text.contains("1 of the points have no place"), "{text}");
+        assert!(text.contains("no place on these axes: 1 points"), "{text}");
         let path = markup.split("<path class=\"curve t1\" d=\"").nth(1).unwrap().split('"').next().unwrap();
         let numbers: Vec<f64> = path.split(['M', 'L', ' ']).filter_map(|n| n.parse().ok()).collect();
         let [x0, y0, x1, y1, x2, y2] = numbers[..] else { panic!("{path}") };

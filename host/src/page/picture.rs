@@ -140,7 +140,11 @@ impl Part for Strip {
         let marks: Vec<Crop> = self.crops.iter().map(|(_, crop)| *crop).collect();
         html.raw("<figure>");
         html.caption(&self.title, &self.words);
-        html.raw("<div class=\"scroll\"><table class=\"strip\"><thead><tr><td></td>");
+        html.raw(&format!(
+            "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"{}\">",
+            escape(&unmarked(&self.title))
+        ));
+        html.raw("<table class=\"strip\"><thead><tr><td></td>");
         self.columns.iter().for_each(|name| html.raw(&format!("<th scope=\"col\">{}</th>", marked(name))));
         html.raw("</tr></thead><tbody>");
         for (name, pictures) in &self.rows {
@@ -212,7 +216,7 @@ impl Part for Gallery {
                 let [r, g, b] = colour(f64::from(i) / 99.0).map(|c| (c * 255.0).round() as u8);
                 // Wider than the step, so that no gap shines through.
                 html.raw(&format!(
-                    "<rect x=\"{}\" y=\"0\" width=\"3.2\" height=\"12\" fill=\"#{r:02x}{g:02x}{b:02x}\"/>",
+                    "<rect x=\"{}\" y=\"0\" width=\"4\" height=\"12\" shape-rendering=\"crispEdges\" fill=\"#{r:02x}{g:02x}{b:02x}\"/>",
                     i * 3
                 ));
             }

@@ -129,7 +129,7 @@ impl Plot {
         svg.end();
         if left_out > 0 {
             html.raw(&format!(
-                "<p class=\"faint\">{left_out} of the points have no place on these axes.</p>"
+                "<p class=\"faint\">Not shown, as they have no place on these axes: {left_out} points.</p>"
             ));
         }
     }
@@ -160,7 +160,7 @@ impl Part for Figure {
             for series in shown {
                 html.raw("<li><svg viewBox=\"0 0 30 14\" aria-hidden=\"true\">");
                 html.raw(&sample(series));
-                html.raw(&format!("</svg>{}</li>", marked(&series.name)));
+                html.raw(&format!("</svg><span>{}</span></li>", marked(&series.name)));
             }
             html.raw("</ul>");
         }

@@ -1,6 +1,6 @@
 //! Tables.
 
-use super::text::{marked, number};
+use super::text::{escape, marked, number, unmarked};
 use super::{Html, Part};
 
 /// Columns under a caption; the first cell of a row is its header.
@@ -26,6 +26,9 @@ pub struct Entry {
     note: Option<usize>,
 }
 
+/// Digits that are worth reading.
+const MOST_DIGITS: i32 = 6;
+
 /// How a cell is meant.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Tone {
@@ -50,7 +53,7 @@ impl Entry {
         }
         let place = error.log10().floor() as i32 - 1;
         let digits =
-            |of: f64| if of == 0.0 { 1 } else { (of.abs().log10().floor() as i32 - place + 1).clamp(1, 15) };
+            |of: f64| if of == 0.0 { 1 } else { (of.abs().log10().floor() as i32 - place + 1).clamp(1, MOST_DIGITS) };
         format!("{} ± {}", number(value, digits(value) as usize), number(error, 2)).into()
     }
 
@@ -112,7 +115,11 @@ impl Table {
 
 impl Part for Table {
     fn html(&self, html: &mut Html) {
-        html.raw("<div class=\"scroll\"><table>");
+        let label =
+            if self.caption.is_empty() { "Table".to_owned() } else { escape(&unmarked(&self.caption)) };
+        html.raw(&format!(
+            "<div class=\"scroll\" tabindex=\"0\" role=\"region\" aria-label=\"{label}\"><table>"
+        ));
         if !self.caption.is_empty() {
             html.raw(&format!("<caption>{}</caption>", marked(&self.caption)));
         }
@@ -163,9 +170,14 @@ fn cell_html(html: &mut Html, cell: &Entry, header: bool, number: bool) {
         .collect::<Vec<_>>()
         .join(" ");
     let class = if class.is_empty() { class } else { format!(" class=\"{class}\"") };
-    let note = cell.note.map(|note| format!("<sup>{note}</sup>")).unwrap_or_default();
+    let note = cell.note.map(|note| format!(" <sup>{}</sup>", letter(note))).unwrap_or_default();
     let (tag, scope) = if header { ("th", " scope=\"row\"") } else { ("td", "") };
     html.raw(&format!("<{tag}{scope}{class}>{}{note}</{tag}>", marked(&cell.text)));
+}
+
+/// A note's letter: a figure would look like an exponent.
+fn letter(note: usize) -> char {
+    char::from(b'a' + ((note + 25) % 26) as u8)
 }
 
 #[cfg(test)]
@@ -188,13 +200,14 @@ mod tests {
             !text.contains("too many") && text.contains("it is x < y") && text.contains("<group>"),
             "{text}"
         );
-        assert!(document.contains("class=\"bad\">only one<sup>1</sup>"));
+        assert!(document.contains("class=\"bad\">only one <sup>a</sup>"));
     }
 
     #[test]
     fn errors_say_how_many_digits_count() {
         assert_eq!(Entry::with_error(2.00314, 0.0021), "2.0031 ± 0.0021".into());
         assert_eq!(Entry::with_error(2186.4, 31.0), "2186 ± 31".into());
+        assert_eq!(Entry::with_error(1.0, 7e-7), "1.00000 ± 7.0×10⁻⁷".into());
         assert_eq!(Entry::with_error(f64::NAN, 1.0), "– ± 1.0".into());
         assert_eq!(Entry::with_error(1.0, 0.0), "1.000 ± 0".into());
     }

@@ -97,7 +97,7 @@ pub fn short(value: f64) -> String {
     let rounded = format!("{size:.6e}");
     let (mantissa, exponent) = rounded.split_once('e').unwrap_or((&rounded, "0"));
     let exponent: i32 = exponent.parse().unwrap_or(0);
-    if (-3..5).contains(&exponent) {
+    if (-3..4).contains(&exponent) {
         let decimals = (6 - exponent).max(0) as usize;
         let text = format!("{size:.decimals$}");
         let text = if text.contains('.') { text.trim_end_matches('0').trim_end_matches('.') } else { &text };
@@ -166,7 +166,8 @@ mod tests {
             (256.0, "256"),
             (-0.5, "−0.5"),
             (0.1 + 0.2, "0.3"),
-            (20_000.0, "20000"),
+            (9_999.0, "9999"),
+            (20_000.0, "2×10⁴"),
             (1e5, "10⁵"),
             (0.0, "0"),
         ];
