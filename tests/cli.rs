@@ -66,6 +66,54 @@ fn renders_writes_and_reports() {
     assert!(text(&compared.stdout).contains("RMSE"), "{}", text(&compared.stdout));
 }
 
+/// Estimates may be negative: pictures are written all the same, floats as they are and colours clamped.
+#[test]
+fn stochastic_renders_are_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let args = [
+        "render",
+        &scene("plates"),
+        "--size",
+        "48x32",
+        "--spp",
+        "1",
+        "--shadow-rays",
+        "4",
+        "--method",
+        "stochastic",
+        "--decomposition",
+        "inclusion",
+        "--probabilities",
+        "optimal",
+        "--split",
+        "sorted",
+        "--quotas",
+        "-o",
+        "a.png",
+        "-o",
+        "a.exr",
+        "-o",
+        "a.hdr",
+        "-o",
+        "a.pfm",
+        "--stats",
+        "s.json",
+    ];
+    let done = occlude(&args, folder.path());
+    assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+    let json = std::fs::read_to_string(folder.path().join("s.json")).expect("statistics");
+    let stats: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+    assert_eq!(stats["method"], "stochastic inclusion optimal sorted quotas");
+    assert!(stats["counts"]["triangle_tests"].as_u64() > Some(1000));
+    for (name, negative) in [("a.exr", true), ("a.pfm", true), ("a.hdr", false), ("a.png", false)] {
+        let compared = occlude(&["compare", "--json", name, "a.exr"], folder.path());
+        assert_eq!(compared.status.code(), Some(0), "{}", text(&compared.stderr));
+        let found: serde_json::Value = serde_json::from_str(&text(&compared.stdout)).expect("JSON");
+        assert_eq!((&found["nan"], &found["infinite"]), (&0.into(), &0.into()), "{name}");
+        assert_eq!(found["negative"].as_u64() > Some(0), negative, "{name}");
+    }
+}
+
 #[test]
 fn quiet_is_quiet() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -78,7 +126,7 @@ fn quiet_is_quiet() {
 #[test]
 fn errors_end_with_two_and_name_the_cause() {
     let folder = tempfile::tempdir().expect("a folder");
-    let cornell = scene("cornell");
+    let (cornell, half_plane) = (scene("cornell"), scene("half_plane"));
     let cases: &[(&[&str], &str)] = &[
         (&["render", "nowhere"], "nowhere"),
         (&["render", &cornell, "-o", "a.jpg"], "png"),
@@ -89,6 +137,40 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["render", &cornell, "--vfov", "180"], "vfov"),
         (&["render", &cornell, "--eye", "1,2"], "three numbers"),
         (&["render", &cornell, "--reference", "none.exr"], "none.exr"),
+        (&["render", &cornell, "--split", "sorted"], "--split is an option of --method stochastic"),
+        (&["render", &cornell, "--quotas"], "--quotas is an option of --method stochastic"),
+        (&["render", &cornell, "--method", "stochastic", "--levels", "3"], "--decomposition residual"),
+        (&["render", &cornell, "--method", "stochastic", "--levels", "1"], "--levels"),
+        (&["render", &cornell, "--method", "stochastic", "--decomposition", "power:1"], "from 2 to 64"),
+        (&["render", &cornell, "--method", "stochastic", "--decomposition", "product"], "power:N"),
+        (
+            &[
+                "render",
+                &half_plane,
+                "--method",
+                "stochastic",
+                "--decomposition",
+                "residual",
+                "--probabilities",
+                "importance",
+            ],
+            "residual takes uniform or optimal",
+        ),
+        (
+            &[
+                "render",
+                &half_plane,
+                "--method",
+                "stochastic",
+                "--decomposition",
+                "residual",
+                "--split",
+                "object",
+                "--levels",
+                "9",
+            ],
+            "at least 9 objects",
+        ),
         (&["--simd", "mmx", "info"], "this CPU has"),
         (&["compare", "a.exr", "b.exr"], "a.exr"),
         (&["generate", "marble"], "marble"),

@@ -78,7 +78,11 @@ impl Probabilities {
             if next.iter().any(|p| !p.is_finite()) {
                 break;
             }
+            let moved = (0..3).fold(0.0f64, |most, i| most.max((next[i] - p[i]).abs()));
             p = next;
+            if moved < SETTLED {
+                break;
+            }
         }
         at_least(p, least)
     }
@@ -101,8 +105,9 @@ impl Default for Probabilities {
     }
 }
 
-/// Rounds after which no figure of a float moves any more.
+/// The most rounds, and the movement after which another would not be seen in 24 bits.
 const ROUNDS: usize = 32;
+const SETTLED: f64 = 1e-8;
 
 fn scaled(weights: [f64; 3]) -> [f64; 3] {
     let sum: f64 = weights.iter().sum();

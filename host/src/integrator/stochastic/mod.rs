@@ -270,14 +270,23 @@ impl<C: Counter> Task for Trace<'_, C> {
 }
 
 /// What is known of a sample.
-#[derive(Clone, Copy, Debug, Default)]
+#[derive(Clone, Copy, Debug)]
 struct Sample {
     /// The choice of [`OneTerm`], or how many levels to ask.
     choice: u32,
-    /// Which of the first two groups lets light through, as far as was asked.
+    /// Which of two groups lets light through, as far as was asked.
     visible: [bool; 2],
-    /// The first group found to block.
-    blocked: Option<u32>,
+    /// Of more groups the first found to block, or [`NONE`].
+    blocked: u32,
+}
+
+/// No group.
+const NONE: u32 = u32::MAX;
+
+impl Sample {
+    fn new(choice: u32) -> Self {
+        Self { choice, visible: [false; 2], blocked: NONE }
+    }
 }
 
 /// The batch at hand: first its test rays, if probabilities are learned, and then its samples.
@@ -293,7 +302,7 @@ struct Work<'a> {
     point: Option<u32>,
     random: Sampler,
     groups: Vec<u8>,
-    order: Vec<(f32, u32)>,
+    order: Vec<u64>,
 
     origin: Vec3,
     light: &'a AreaLight,
@@ -380,7 +389,7 @@ impl<'a> Work<'a> {
                 }
             }
             self.samples.clear();
-            self.samples.resize(self.tests[0].len(), Sample::default());
+            self.samples.resize(self.tests[0].len(), Sample::new(0));
         } else {
             self.choose();
         }
@@ -406,36 +415,46 @@ impl<'a> Work<'a> {
                 (_, Some(levels)) => levels.depth(u),
                 (_, None) => 0,
             };
-            self.samples.push(Sample { choice: choice as u32, ..Sample::default() });
+            self.samples.push(Sample::new(choice as u32));
         }
     }
 
     /// Collects the samples that want to know of a group.
     fn gather(&mut self, group: usize) {
+        // No branches: which samples want to know is as random as can be.
         self.places.clear();
-        self.asked.iter_mut().for_each(Vec::clear);
-        let batch = &self.questions.batches[self.batch];
-        let ([x, y, z], first) = if self.testing {
-            (&self.tests, 0)
-        } else {
-            (&self.questions.targets, batch.samples.start as usize)
-        };
-        for (place, sample) in self.samples.iter().enumerate() {
-            let wants = match &self.plan {
-                Plan::Terms(_) if self.testing => true,
-                Plan::Reach(_) if self.testing => sample.blocked.is_none(),
-                Plan::Terms(one) => {
-                    let needs = one.needs(sample.choice as usize);
-                    if group == 0 { needs.a } else { needs.b.given(sample.visible[0]) }
+        self.places.resize(self.samples.len(), 0);
+        let mut len = 0;
+        match &self.plan {
+            Plan::Terms(one) => {
+                let mut wants = [[self.testing; 2]; 3];
+                for (choice, wants) in wants.iter_mut().enumerate().filter(|_| !self.testing) {
+                    let needs = one.needs(choice);
+                    *wants = [false, true].map(|a| if group == 0 { needs.a } else { needs.b.given(a) });
                 }
-                Plan::Reach(_) => group < sample.choice as usize && sample.blocked.is_none(),
-            };
-            if wants {
-                self.places.push(place as u32);
-                for (asked, from) in self.asked.iter_mut().zip([x, y, z]) {
-                    asked.push(from[first + place]);
+                for (place, sample) in (0u32..).zip(&self.samples) {
+                    self.places[len] = place;
+                    len += usize::from(wants[sample.choice as usize % 3][usize::from(sample.visible[0])]);
                 }
             }
+            Plan::Reach(_) => {
+                let least = if self.testing { 0 } else { group as u32 + 1 };
+                for (place, sample) in (0u32..).zip(&self.samples) {
+                    self.places[len] = place;
+                    len += usize::from(sample.blocked == NONE && sample.choice >= least);
+                }
+            }
+        }
+        self.places.truncate(len);
+        let samples = &self.questions.batches[self.batch].samples;
+        for (axis, asked) in self.asked.iter_mut().enumerate() {
+            let from = if self.testing {
+                &self.tests[axis][..]
+            } else {
+                &self.questions.targets[axis][samples.start as usize..samples.end as usize]
+            };
+            asked.clear();
+            asked.extend(self.places.iter().map(|&place| from[place as usize]));
         }
         self.blocked.clear();
         self.blocked.resize(self.places.len().div_ceil(64), 0);
@@ -443,14 +462,19 @@ impl<'a> Work<'a> {
 
     /// Hands the answers back to the samples that asked.
     fn scatter(&mut self, group: usize) {
-        for (i, &place) in self.places.iter().enumerate() {
-            let sample = &mut self.samples[place as usize];
-            let visible = self.blocked[i / 64] >> (i % 64) & 1 == 0;
-            if let Some(known) = sample.visible.get_mut(group) {
-                *known = visible;
+        let visible = |blocked: &[u64], i: usize| blocked[i / 64] >> (i % 64) & 1 == 0;
+        match &self.plan {
+            Plan::Terms(_) => {
+                for (i, &place) in self.places.iter().enumerate() {
+                    self.samples[place as usize].visible[group & 1] = visible(&self.blocked, i);
+                }
             }
-            if !visible && sample.blocked.is_none() {
-                sample.blocked = Some(group as u32);
+            // Only samples that were free so far have asked.
+            Plan::Reach(_) => {
+                for (i, &place) in self.places.iter().enumerate() {
+                    let answer = if visible(&self.blocked, i) { NONE } else { group as u32 };
+                    self.samples[place as usize].blocked = answer;
+                }
             }
         }
     }
@@ -471,7 +495,8 @@ impl<'a> Work<'a> {
             ),
             Plan::Reach(reach) => {
                 let levels = falling(reach);
-                let value = |sample: &Sample| levels.value(sample.blocked.map(|group| group as usize));
+                let blocked = |sample: &Sample| (sample.blocked != NONE).then_some(sample.blocked as usize);
+                let value = |sample: &Sample| levels.value(blocked(sample));
                 self.estimates.extend(self.samples.iter().map(value));
             }
         }
@@ -483,10 +508,11 @@ impl<'a> Work<'a> {
         if let Plan::Reach(reach) = &mut self.plan {
             // Half a ray more for each group, so that none counts as never blocking.
             let mut first = [0.5; Settings::MOST_GROUPS];
-            self.samples
-                .iter()
-                .filter_map(|sample| sample.blocked)
-                .for_each(|group| first[group as usize] += 1.0);
+            for sample in &self.samples {
+                if let Some(first) = first.get_mut(sample.blocked as usize) {
+                    *first += 1.0;
+                }
+            }
             let rays = self.samples.len() as f64 + 0.5 * (reach.len() + 1) as f64;
             first.iter_mut().for_each(|first| *first /= rays);
             let costs = [1.0; Settings::MOST_GROUPS];

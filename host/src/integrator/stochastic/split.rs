@@ -13,12 +13,12 @@ use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node, Part};
 /// How blockers are divided into groups.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
 pub enum Split {
-    /// At random for each point, as many units to each group.
+    /// At random for each point, in equal parts: of triangles, or of subtrees of the scene's tree if there are over 256.
     #[default]
     Random,
-    /// By their distance from each point, nearest first, as many triangles to each group.
+    /// By the distance of their boxes from each point, nearest first, in equal parts.
     Sorted,
-    /// Whole objects of the file, the same for all points, about as many triangles to each group.
+    /// Whole objects of the file, the same for all points, in parts as equal as the objects allow.
     Object,
 }
 
@@ -155,13 +155,7 @@ impl Units {
     }
 
     /// Writes the group of each unit as it is for a point.
-    pub(super) fn draw(
-        &self,
-        x: Vec3,
-        random: &mut Sampler,
-        groups: &mut Vec<u8>,
-        order: &mut Vec<(f32, u32)>,
-    ) {
+    pub(super) fn draw(&self, x: Vec3, random: &mut Sampler, groups: &mut Vec<u8>, order: &mut Vec<u64>) {
         groups.clear();
         let count = self.groups;
         match self.split {
@@ -175,16 +169,18 @@ impl Units {
                 }
             }
             Split::Sorted => {
+                // Squares are not negative, so that their bits are in their order; then come the units.
                 order.clear();
-                order.extend(self.units.iter().zip(0..).map(|(unit, index)| {
+                order.extend(self.units.iter().zip(0u64..).map(|(unit, index)| {
                     let nearest = x.clamp(unit.lower, unit.upper);
-                    (nearest.distance_squared(x), index)
+                    u64::from(nearest.distance_squared(x).to_bits()) << 32 | index
                 }));
-                order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+                order.sort_unstable();
                 groups.resize(self.units.len(), 0);
                 let all: u64 = self.units.iter().map(|unit| u64::from(unit.triangles)).sum();
                 let mut before = 0;
-                for &(_, index) in order.iter() {
+                for &key in order.iter() {
+                    let index = key as u32;
                     // The group that the middle of its triangles falls into.
                     let triangles = u64::from(self.units[index as usize].triangles);
                     let group = (2 * before + triangles) * count as u64 / (2 * all.max(1));
