@@ -65,8 +65,8 @@ impl Folder {
 impl Drop for Folder {
     fn drop(&mut self) {
         for folder in &self.made {
-            // Refused if there is anything in it, as there should be.
-            if fs::remove_dir(folder).is_err() {
+            // Refused if there is anything in it, as there should be. One may not have come to be.
+            if fs::remove_dir(folder).is_err_and(|error| error.kind() != ErrorKind::NotFound) {
                 break;
             }
         }

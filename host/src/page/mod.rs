@@ -247,8 +247,17 @@ pub(crate) mod tests {
                 axis.clone(),
                 Axis::default(),
             )));
-            let mut bars = Bars::new("<bars>", "w", axis, 1.0);
-            bars.group("g", bad.map(|value| Bar { name: "<n>".to_owned(), value, error: value, tone: 11 }));
+            let mut bars = Bars::new("<bars>", "w", axis, 1.0).columns("<v>", "&");
+            bars.group(
+                "g",
+                bad.map(|value| Bar {
+                    name: "<n>".to_owned(),
+                    value,
+                    error: value,
+                    beside: "<b>".to_owned(),
+                    tone: 11,
+                }),
+            );
             bars.group("empty", []);
             page.add(&bars);
         }

@@ -52,8 +52,9 @@ impl Entry {
             return format!("{} ± {}", number(value, 4), number(error, 2)).into();
         }
         let place = error.log10().floor() as i32 - 1;
-        let digits =
-            |of: f64| if of == 0.0 { 1 } else { (of.abs().log10().floor() as i32 - place + 1).clamp(1, MOST_DIGITS) };
+        let digits = |of: f64| {
+            if of == 0.0 { 1 } else { (of.abs().log10().floor() as i32 - place + 1).clamp(1, MOST_DIGITS) }
+        };
         format!("{} ± {}", number(value, digits(value) as usize), number(error, 2)).into()
     }
 

@@ -110,6 +110,11 @@ struct Measured {
 }
 
 impl Measured {
+    /// Tests of a ray against a triangle, for each ray that exact visibility asks.
+    fn tests_a_ray(&self, exact: &Self) -> f64 {
+        self.counts.triangle_tests as f64 / exact.counts.rays.max(1) as f64
+    }
+
     /// Efficiency relative to another way, by visibility alone and whole, and the relative standard error.
     fn relative(&self, to: &Self) -> (f64, f64, f64) {
         let error = (self.mse_error / self.mse).hypot(to.mse_error / to.mse);
@@ -163,7 +168,8 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
                 }
                 _ => {
                     "Exact is 1. To the right is better, to the left is worse: 0.1 means ten times the time for the same error. Whiskers are 95 % \
-                     intervals of the errors; times move by some percent from run to run."
+                     intervals of the errors; times move by some percent from run to run. Tests \
+                     are those of a ray against a triangle."
                 }
             };
             Bars::new(
@@ -172,6 +178,7 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
                 Axis::log("1 / (mean square error × time), exact = 1"),
                 1.0,
             )
+            .columns("efficiency", "tests a ray")
         })
         .collect();
     let mut tables = Vec::new();
@@ -209,19 +216,14 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
                 });
                 strip.row(kind.name(), std::iter::once(reference).chain(pictures));
             }
-            bars[r].group(
-                title.clone(),
-                ways.iter().zip(&measured).skip(1).map(|(way, measured)| {
-                    let (visibility, _, error) = measured.relative(exact);
-                    Bar {
-                        name: way.name.to_owned(),
-                        value: visibility,
-                        error: super::sample::Z95 * error * visibility,
-                        tone: way.tone,
-                    }
-                }),
-            );
-            tables.push(table(&title, case, &ways, &measured, &mut tally));
+            let bar = |(way, measured): (&Way, &Measured)| {
+                let (value, _, error) = measured.relative(exact);
+                let error = if way.settings.is_some() { super::sample::Z95 * error * value } else { 0.0 };
+                let tests = number(measured.tests_a_ray(exact), 3);
+                Bar { name: way.name.to_owned(), value, error, beside: tests, tone: way.tone }
+            };
+            bars[r].group(title.clone(), ways.iter().zip(&measured).map(bar));
+            tables.push((title.clone(), case, table(&title, case, &ways, &measured, &mut tally)));
             for (way, measured) in ways.iter().zip(&measured) {
                 let (visibility, whole, _) = measured.relative(exact);
                 let shots = exact.counts.rays.max(1) as f64;
@@ -236,7 +238,7 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
                     (measured.mse_error / measured.mse).into(),
                     measured.visibility.into(),
                     measured.whole.into(),
-                    (measured.counts.triangle_tests as f64 / shots).into(),
+                    measured.tests_a_ray(exact).into(),
                     (measured.counts.node_tests as f64 / shots).into(),
                     visibility.into(),
                     whole.into(),
@@ -248,7 +250,10 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     bars.iter().for_each(|bars| page.add(bars));
     page.prose(&tally.words());
     page.in_short(tally.short());
-    tables.iter().for_each(|table| page.add(table));
+    page.heading("The figures behind the bars");
+    for (title, case, table) in &tables {
+        page.folded(&format!("{title}, {}", case.words()), table);
+    }
     Ok(data)
 }
 
@@ -310,7 +315,7 @@ impl Tally {
 }
 
 fn table(title: &str, case: Case, ways: &[Way], measured: &[Measured], tally: &mut Tally) -> Table {
-    let mut table = Table::new(format!("{title}, {}", case.words()))
+    let mut table = Table::new("")
         .words("form")
         .numbers("RMSE")
         .numbers("visibility, ms")
@@ -323,8 +328,7 @@ fn table(title: &str, case: Case, ways: &[Way], measured: &[Measured], tally: &m
     let shots = exact.counts.rays.max(1) as f64;
     for (way, measured) in ways.iter().zip(measured) {
         let (visibility, whole, error) = measured.relative(exact);
-        let tests = measured.counts.triangle_tests as f64 / shots;
-        let exact_tests = exact.counts.triangle_tests as f64 / shots;
+        let (tests, exact_tests) = (measured.tests_a_ray(exact), exact.tests_a_ray(exact));
         if way.settings.is_some() {
             tally.add(
                 visibility,
@@ -467,5 +471,40 @@ impl Setting {
         let (sum, square) = squares.fold((0.0, 0.0), |(sum, square), d| (sum + d, square + d * d));
         let mean = sum / n;
         (mean, ((square / n - mean * mean).max(0.0) / n).sqrt())
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reproduce::theory::tests::run;
+    use std::sync::atomic::AtomicBool;
+
+    /// Only what separates the error from the time: same points, so a reference has no error against itself, more rays
+    /// have less, and one term has more than exact visibility.
+    #[test]
+    fn errors_are_those_of_visibility_alone() {
+        let stop = AtomicBool::new(false);
+        let run = run(&stop);
+        let leg = Leg::new(&run, 0.0, 1.0);
+        let size = Size { pixels: (40, 25), triangles: 2_000, reference_rays: 512, ..QUICK };
+        let setting = Setting::new(&leg, Kind::Spheres, &size).expect("nobody stops it");
+        assert_eq!(setting.error(&setting.reference), (0.0, 0.0));
+        let ways = ways();
+        let error = |way: &Way, rays| {
+            setting.measure(&leg, way, Case { rays, ..STRATIFIED }, 1).expect("nobody stops it").mse
+        };
+        let [few, many] = [4, 64].map(|rays| error(&ways[0], rays));
+        assert!(many > 0.0 && many < 0.3 * few, "{few} {many}");
+        let balanced = ways.iter().find(|way| way.name == "Balanced").expect("one of them");
+        assert!(error(balanced, 64) > 4.0 * many);
+    }
+
+    #[test]
+    fn variations_have_the_name_of_their_form() {
+        let ways = ways();
+        let names: Vec<String> = ways.iter().map(|way| way.full_name(&ways)).collect();
+        assert!(names.iter().all(|name| !name.contains("same")), "{names:?}");
+        assert!(names.iter().enumerate().all(|(i, name)| !names[..i].contains(name)), "{names:?}");
     }
 }

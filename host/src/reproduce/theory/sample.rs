@@ -83,3 +83,30 @@ pub(super) fn sample(
         asked,
     })
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::reproduce::theory::tests::run;
+    use std::sync::atomic::AtomicBool;
+
+    #[test]
+    fn moments_of_uniform_numbers() {
+        let stop = AtomicBool::new(false);
+        let draw = |random: &mut Sampler| (f64::from(random.uniform()), 3);
+        let seen = sample(&run(&stop), 7, 1_000_000, 0.4, draw).expect("nobody stops it");
+        // Fourth moment 1/80, variance 1/12.
+        let error = ((1.0 / 80.0 - 1.0 / 144.0) / 1e6f64).sqrt();
+        assert!((seen.variance_error / error - 1.0).abs() < 0.01, "{seen:?}");
+        assert!(seen.off(1.0 / 12.0) < 5.0 && (seen.mean - 0.5).abs() < 5.0 * seen.mean_error(), "{seen:?}");
+        assert_eq!((seen.asked, seen.count), (3.0, 1_000_000));
+        assert!(seen.off(0.09) > 50.0);
+    }
+
+    #[test]
+    fn a_constant_has_no_spread() {
+        let stop = AtomicBool::new(false);
+        let seen = sample(&run(&stop), 7, 20_000, 2.0, |_| (2.0, 0)).expect("nobody stops it");
+        assert_eq!((seen.mean, seen.variance, seen.variance_error, seen.off(0.0)), (2.0, 0.0, 0.0, 0.0));
+    }
+}
