@@ -51,7 +51,7 @@ impl Bars {
 const LEFT: f64 = 176.0;
 const WIDTH: f64 = 330.0;
 /// Where the columns of figures end, to the right of the bars.
-const COLUMNS: [f64; 2] = [LEFT + WIDTH + 74.0, LEFT + WIDTH + 144.0];
+const COLUMNS: [f64; 2] = [LEFT + WIDTH + 70.0, LEFT + WIDTH + 150.0];
 const TOP: f64 = 22.0;
 const BAR: f64 = 20.0;
 
