@@ -166,7 +166,7 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     let figures = [
         "The points on the light are stratified, as this renderer does it by default (a shifted lattice). Exact visibility \
          gains from that: its error falls faster than the root of the number of rays. The random choice of a term does not.",
-        "The points on the light are independent, as in the textbook. Now the exact test is as slow as it can be, and all \
+        "The points on the light are independent, as in the textbook. Now exact visibility converges no faster than the forms do, and all \
          curves are parallel: a comparison that flatters the random forms.",
     ];
     for (((pattern, _), paintings), words) in patterns.iter().zip(&all).zip(figures) {

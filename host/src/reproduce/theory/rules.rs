@@ -57,7 +57,7 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     page.section("Importance sampling, and what would be better");
     page.prose(
         "The terms need not be equally likely. The thesis traces 64 test rays from each point, estimates what each term contributes, and \
-         chooses terms in proportion. That is the right thing to do for terms that vary little, and these do not: they are 0 or ±1. The \
+         chooses terms in proportion. That would be right for terms that vary little; those of the first form are 0 or ±1. The \
          least variance for given work has *p* in proportion to the root of the term’s mean square over its cost (“optimal” below). And \
          instead of drawing a term for each ray, one can give exactly the right share of a pixel’s rays to each term (quotas), which \
          takes the noise of the draw out.",
