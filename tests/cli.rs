@@ -1,5 +1,6 @@
 //! The command as a user meets it: what it prints, what it writes, how it ends.
 
+use occlude_host::reproduce::theory::FILES;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -246,6 +247,9 @@ fn the_theory_is_reproduced() {
     run("3", "two");
     let (one, two) = (folder.path().join("new/one"), folder.path().join("two"));
 
+    let count = std::fs::read_dir(&one).expect("a folder").count();
+    assert_eq!(count, 1 + FILES.len(), "the page and its data");
+    assert!(FILES.iter().all(|file| one.join(file).exists()));
     // Everything but times is the same for any number of threads.
     for file in ["variance.csv", "plates.csv", "halving.csv", "eight_plates.csv"] {
         let [one, two] = [&one, &two].map(|folder| std::fs::read(folder.join(file)).expect(file));

@@ -58,7 +58,7 @@ struct TheoryArgs {
 /// Runs the command.
 pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
     let What::Theory(args) = &args.what;
-    let folder = Folder::claim(&args.output, theory::MAKER, args.force)?;
+    let folder = Folder::claim(&args.output, theory::MAKER, &theory::FILES, args.force)?;
     let stop = super::interruptible("the page");
     let progress = Progress::new(args.quiet);
     let run = Run {

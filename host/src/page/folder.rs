@@ -25,8 +25,9 @@ impl Folder {
     /// Makes the folder, and those above it, if it is not there; a folder that is there has to be empty, or to hold
     /// an earlier page by the same `maker`, which is then replaced. With `force` anything may be in it.
     ///
-    /// Whether the page can be written is tried at once, since it may take minutes until there is one.
-    pub fn claim(path: &Path, maker: &str, force: bool) -> Result<Self> {
+    /// Whether the page and these files of `data` can be written is tried at once, since it may take minutes until
+    /// they are there.
+    pub fn claim(path: &Path, maker: &str, data: &[&str], force: bool) -> Result<Self> {
         let occupied = match fs::read_dir(path) {
             Ok(mut entries) => entries.next().is_some(),
             Err(error) if error.kind() == ErrorKind::NotFound => false,
@@ -47,7 +48,9 @@ impl Folder {
         let made = path.ancestors().take_while(missing).map(Path::to_owned).collect();
         let folder = Self { path: path.to_owned(), made };
         fs::create_dir_all(path).map_err(Error::io("creating", path))?;
-        output::check_writable_bytes(path.join(INDEX))?;
+        for name in data.iter().chain([&INDEX]) {
+            output::check_writable_bytes(path.join(name))?;
+        }
         Ok(folder)
     }
 
@@ -90,28 +93,40 @@ mod tests {
         let root = tempfile::tempdir().unwrap();
         let path = root.path().join("a/b");
         let page = Page::new("occlude test", "title", "lead");
-        Folder::claim(&path, "occlude test", false).unwrap().write(INDEX, page.html("").as_bytes()).unwrap();
-        drop(Folder::claim(&path, "occlude test", false).unwrap());
-        let said = Folder::claim(&path, "occlude other", false).unwrap_err().to_string();
+        Folder::claim(&path, "occlude test", &[], false)
+            .unwrap()
+            .write(INDEX, page.html("").as_bytes())
+            .unwrap();
+        drop(Folder::claim(&path, "occlude test", &[], false).unwrap());
+        let said = Folder::claim(&path, "occlude other", &[], false).unwrap_err().to_string();
         assert!(said.contains("--force") && said.contains("occlude other"), "{said}");
-        drop(Folder::claim(&path, "occlude other", true).unwrap());
+        drop(Folder::claim(&path, "occlude other", &[], true).unwrap());
         fs::write(root.path().join("file"), "x").unwrap();
-        let said = Folder::claim(root.path(), "occlude test", false).unwrap_err().to_string();
+        let said = Folder::claim(root.path(), "occlude test", &[], false).unwrap_err().to_string();
         assert!(said.contains("not empty"), "{said}");
         for below in ["file", "file/below"] {
             let said =
-                Folder::claim(&root.path().join(below), "occlude test", false).unwrap_err().to_string();
+                Folder::claim(&root.path().join(below), "occlude test", &[], false).unwrap_err().to_string();
             assert!(said.contains("file"), "{said}");
         }
     }
 
     #[test]
+    fn what_cannot_be_written_is_known_at_once() {
+        let root = tempfile::tempdir().unwrap();
+        fs::create_dir(root.path().join("a.csv")).unwrap();
+        let said = Folder::claim(root.path(), "occlude test", &["a.csv"], true).unwrap_err().to_string();
+        assert!(said.contains("a.csv: it is a folder"), "{said}");
+        assert!(root.path().join("a.csv").exists());
+    }
+
+    #[test]
     fn what_stays_empty_goes_again() {
         let root = tempfile::tempdir().unwrap();
-        drop(Folder::claim(&root.path().join("a/b/c"), "occlude test", false).unwrap());
+        drop(Folder::claim(&root.path().join("a/b/c"), "occlude test", &[], false).unwrap());
         assert!(!root.path().join("a").exists());
         fs::create_dir(root.path().join("mine")).unwrap();
-        drop(Folder::claim(&root.path().join("mine"), "occlude test", false).unwrap());
+        drop(Folder::claim(&root.path().join("mine"), "occlude test", &[], false).unwrap());
         assert!(root.path().join("mine").exists());
     }
 }

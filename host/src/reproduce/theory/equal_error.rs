@@ -131,12 +131,14 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     let size = if leg.run.quick { QUICK } else { WHOLE };
     page.section("At equal error");
     page.prose(
-        "Fewer tests a ray are a gain only if the rays do not have to be so many more. What counts is the time until the error is \
-         small enough. As the mean square error falls with the number of rays, its product with the time is, for a form whose error falls by \
-         the root law, always the same, and its inverse is the form’s efficiency. Here it is measured, relative to that of exact visibility, on \
-         scenes that this program generates: same shading points, same points on the lights (stratified), same threads, one run, the mean square error \
-         against exact visibility with many more rays from the same shading points. The exact method asks for all rays of a point and light in one \
-         traversal, and the forms do the same for the rays that ask for a group.",
+        "Fewer tests a ray are a gain only if the rays do not have to be so many more. What counts is the \
+         time until the error is small enough. As the mean square error falls with the number of rays, its \
+         product with the time is, for a form whose error falls by the root law, always the same, and its \
+         inverse is the form’s efficiency. Here it is measured, relative to that of exact visibility, on \
+         scenes that this program generates: same shading points, same points on the lights (stratified), \
+         same threads, one run, the mean square error against exact visibility with many more rays from the \
+         same shading points. The exact method asks for all rays of a point and light in one traversal, and \
+         the forms do the same for the rays that ask for a group.",
     );
     let mut data = Data::new(&[
         "scene",
@@ -167,13 +169,13 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
         .map(|case| {
             let words = match case.pattern {
                 Pattern::Random => {
-                    "The same with independent points on the lights, as in the textbook: exact visibility is now as noisy as it can be, which flatters \
-                     the forms."
+                    "The same with independent points on the lights, as in the textbook: exact visibility is \
+                     now as noisy as it can be, which flatters the forms."
                 }
                 _ => {
-                    "Exact is 1. To the right is better, to the left is worse: 0.1 means ten times the time for the same error. Whiskers are 95 % \
-                     intervals of the errors; times move by some percent from run to run. Tests \
-                     are those of a ray against a triangle."
+                    "Exact is 1. To the right is better, to the left is worse: 0.1 means ten times the time \
+                     for the same error. Whiskers are 95 % intervals of the errors; times move by some \
+                     percent from run to run. Tests are those of a ray against a triangle."
                 }
             };
             Bars::new(
@@ -299,8 +301,8 @@ impl Tally {
     fn short(&self) -> String {
         let best = self.best.as_ref().map_or(f64::NAN, |best| best.0);
         format!(
-            "At equal error {} of {} cases (forms on three scenes) beat exact visibility, though {} of them need fewer triangle tests a ray; \
-             the best reaches {} of its efficiency.",
+            "At equal error {} of {} cases (forms on three scenes) beat exact visibility, though {} of them \
+             need fewer triangle tests a ray; the best reaches {} of its efficiency.",
             if self.wins == 0 { "none".to_owned() } else { self.wins.to_string() },
             self.cases,
             self.fewer_tests,
@@ -319,17 +321,19 @@ impl Tally {
         let as_exact = match &self.as_exact[..] {
             [] => String::new(),
             cases => format!(
-                " In {} of them the picture is that of exact visibility, bit for bit: what is in the second group, and is left out half of the time, \
-                 never blocks anything there that the first does not. These are {}.",
+                " In {} of them the picture is that of exact visibility, bit for bit: what is in the second \
+                 group, and is left out half of the time, never blocks anything there that the first does \
+                 not. These are {}.",
                 self.cases_as_exact,
                 cases.join(" and ")
             ),
         };
         format!(
-            "Of these {} cases (a form, a scene, a number of rays and their pattern) {} need fewer triangle tests than exact visibility, and {wins}. \
-             The best is {best_at} with {} of its efficiency, the last {worst_at} with {}.{as_exact} This is what the slides’ tables, which compare at \
-             an equal number of rays, do not show: tests are saved, and more than that is lost in noise. One term of a sum is the ground to stand on, \
-             and not the method that wins.",
+            "Of these {} cases (a form, a scene, a number of rays and their pattern) {} need fewer triangle \
+             tests than exact visibility, and {wins}. The best is {best_at} with {} of its efficiency, the \
+             last {worst_at} with {}.{as_exact} This is what the slides’ tables, which compare at an equal \
+             number of rays, do not show: tests are saved, and more than that is lost in noise. One term of \
+             a sum is the ground to stand on, and not the method that wins.",
             self.cases,
             self.fewer_tests,
             number(*best, 3),
@@ -508,8 +512,8 @@ mod tests {
     use crate::reproduce::theory::tests::run;
     use std::sync::atomic::AtomicBool;
 
-    /// Only what separates the error from the time: same points, so a reference has no error against itself, more rays
-    /// have less, and one term has more than exact visibility.
+    /// Same points: the reference has no error against itself, more rays have less, and one term has more than exact
+    /// visibility.
     #[test]
     fn errors_are_those_of_visibility_alone() {
         let stop = AtomicBool::new(false);

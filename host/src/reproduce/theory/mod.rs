@@ -19,6 +19,10 @@ use std::time::Instant;
 /// The command, by which its pages know each other.
 pub const MAKER: &str = "occlude reproduce theory";
 
+/// The files of data beside the page.
+pub const FILES: [&str; 6] =
+    ["variance.csv", "plates.csv", "halving.csv", "eight_plates.csv", "probabilities.csv", "efficiency.csv"];
+
 /// Runs everything and makes the page.
 pub fn theory(run: &Run<'_>) -> Result<Reproduced, Halted> {
     let start = Instant::now();
@@ -29,8 +33,9 @@ pub fn theory(run: &Run<'_>) -> Result<Reproduced, Halted> {
     let mut page = Page::new(
         MAKER,
         "Stochastic visibility",
-        "What becomes of a shadow ray if only a random part of what may be in its way is tested: the tables and figures of \
-         Niels Billen’s thesis on stochastic visibility, run again, checked, and taken on to where they were not: to equal error.",
+        "What becomes of a shadow ray if only a random part of what may be in its way is tested: the tables \
+         and figures of Niels Billen’s thesis on stochastic visibility, run again, checked, and taken on to \
+         where they were not: to equal error.",
     );
     let mut data = Vec::new();
     pool.install(|| -> Result<(), Halted> {
@@ -46,9 +51,10 @@ pub fn theory(run: &Run<'_>) -> Result<Reproduced, Halted> {
     data.push(("efficiency.csv", equal_error::add(&Leg::new(run, 0.45, 1.0), &mut page)?));
     page.data("efficiency.csv", "time, work and error of every form");
     let foot = format!(
-        "Made by `{MAKER}{}` of Occlude {} in {:.0} s: {} threads, {}, seed {}. All but the times comes out the same, digit for \
-         digit, whatever the number of threads. Billen, Engelen, Lagae and Dutré, “Probabilistic Visibility Evaluation for \
-         Direct Illumination”, Computer Graphics Forum 32(4), 2013.",
+        "Made by `{MAKER}{}` of Occlude {} in {:.0} s: {} threads, {}, seed {}. All but the times comes out \
+         the same, digit for digit, whatever the number of threads. Billen, Engelen, Lagae and Dutré, \
+         “Probabilistic Visibility Evaluation for Direct Illumination”, Computer Graphics Forum 32(4), \
+         2013.",
         if run.quick { " --quick" } else { "" },
         env!("CARGO_PKG_VERSION"),
         start.elapsed().as_secs_f64(),
@@ -79,7 +85,8 @@ fn terms(form: &Decomposition) -> String {
             "(V_{A} − 1/3) + (V_{B} − 1/3) + ((1 − V_{A})(1 − V_{B}) − 1/3), the slides’ first alternative"
         }
         Decomposition::Power(_) => {
-            "−V_{A}/d − V_{B}/d + (V_{A} + V_{B})^{n}/d with d = 2^{n} − 2, the slides’ second alternative, for n = 8"
+            "−V_{A}/d − V_{B}/d + (V_{A} + V_{B})^{n}/d with d = 2^{n} − 2, the slides’ second alternative, \
+             for n = 8"
         }
         Decomposition::Residual { .. } => "*u* V_{A} + V_{A}(V_{B} − *u*).",
     };

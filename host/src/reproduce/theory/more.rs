@@ -65,10 +65,11 @@ impl Way {
 pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<[(&'static str, Data); 2], Halted> {
     page.section("More primitives");
     page.prose(
-        "With more than two things in the way the slides cut them at random into two equal halves, and propose to cut each half again, \
-         until single primitives are left and one ray tests next to nothing. They also say what comes of it: “a great increase of \
-         the variance”. How great follows from the forms: the second moments of the halves multiply, and for the balanced form with *n* \
-         primitives, none of them in the way, the variance of one ray is 3^{n − 1} − 1.",
+        "With more than two things in the way the slides cut them at random into two equal halves, and \
+         propose to cut each half again, until single primitives are left and one ray tests next to nothing. \
+         They also say what comes of it: “a great increase of the variance”. How great follows from the \
+         forms: the second moments of the halves multiply, and for the balanced form with *n* primitives, \
+         none of them in the way, the variance of one ray is 3^{n − 1} − 1.",
     );
     let halving = |form| Halving::new(form, &Probabilities::UNIFORM).map_err(unsound);
     let (inclusion, balanced) =
@@ -212,22 +213,25 @@ fn variances(
     page.add(
         &Figure::new(
             "Variance against the number of primitives",
-            "Points are samples, bars 95 % intervals where they are longer than a point. The marks of the balanced form should lie on the \
-             dashed line.",
+            "Points are samples, bars 95 % intervals where they are longer than a point. The marks of the \
+             balanced form should lie on the dashed line.",
         )
         .plot(plot),
     );
     page.prose(&format!(
-        "The formula holds: the sampled variances of the balanced form are within {} standard errors of it. With {most} primitives {} rays \
-         have to be averaged until the variance is down to 1, to find that nothing is in the way. The levels beside it take the primitives in an \
-         order, and ask each only if all before it let the ray through, and then not always: the chance to get to level i, Q_{{i}}, falls evenly from 1 \
-         to 1/n. What comes first is asked always, what comes last seldom, and what is found to block at level i counts 1/Q_{{i}}-fold. If nothing is in \
-         the way the result is 1 without fail, and at worst the variance is n − 1, not 3^{{n − 1}} − 1.",
+        "The formula holds: the sampled variances of the balanced form are within {} standard errors of it. \
+         With {most} primitives {} rays have to be averaged until the variance is down to 1, to find that \
+         nothing is in the way. The levels beside it take the primitives in an order, and ask each only if \
+         all before it let the ray through, and then not always: the chance to get to level i, Q_{{i}}, \
+         falls evenly from 1 to 1/n. What comes first is asked always, what comes last seldom, and what is \
+         found to block at level i counts 1/Q_{{i}}-fold. If nothing is in the way the result is 1 without \
+         fail, and at worst the variance is n − 1, not 3^{{n − 1}} − 1.",
         number(worst, 2),
         number(steepest, 4),
     ));
     page.in_short(format!(
-        "Recursive halving of {most} primitives has a variance of {} by the formula 3^{{n − 1}} − 1, and of {} in {} samples.",
+        "Recursive halving of {most} primitives has a variance of {} by the formula 3^{{n − 1}} − 1, and of \
+         {} in {} samples.",
         number(steepest, 4),
         number(sampled, 4),
         super::grouped(samples),
@@ -243,8 +247,8 @@ fn pictures(leg: &Leg<'_>, page: &mut Page, ways: &[(&str, Way)]) -> Result<Data
         RAYS.map(|rays| if rays == 1 { "1 shadow ray".to_owned() } else { format!("{rays} shadow rays") });
     let mut strip = Strip::new(
         "Eight plates, and recursive halving down to single ones",
-        "As on the slides: 1, 8, 64 and 256 rays a pixel. Black and white alike are estimates far outside 0 to 1, cut off by the screen and \
-         not by the program.",
+        "As on the slides: 1, 8, 64 and 256 rays a pixel. Black and white alike are estimates far outside 0 \
+         to 1, cut off by the screen and not by the program.",
         columns,
     );
     let mut plot = Plot::new("", Axis::log("shadow rays a pixel").at(RAYS.map(f64::from)), Axis::log("RMSE"));
@@ -305,9 +309,10 @@ fn pictures(leg: &Leg<'_>, page: &mut Page, ways: &[(&str, Way)]) -> Result<Data
     page.add(&table);
     if let [exact, _, balanced, levels] = summary[..] {
         page.prose(&format!(
-            "Halving with the balanced form asks {} plates a ray where exact visibility asks {}, and pays for it with {} times its error at \
-             256 rays, which only {} times as many rays would make up for. Levels ask {} plates, and the error is {} times that of exact. \
-             Nobody should use recursive halving; it is here to be seen.",
+            "Halving with the balanced form asks {} plates a ray where exact visibility asks {}, and pays \
+             for it with {} times its error at 256 rays, which only {} times as many rays would make up for. \
+             Levels ask {} plates, and the error is {} times that of exact. Nobody should use recursive \
+             halving; it is here to be seen.",
             number(balanced.0, 3),
             number(exact.0, 3),
             number(balanced.1, 3),

@@ -116,22 +116,25 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
 
     page.section("Two plates under a square light");
     page.prose(
-        "A floor, seen from above, and over it a square light and two plates that hang at different heights. The plates are the \
-         two groups: A is the left, lower one, B the right, higher one. What each hides of the light from a point of the floor is a \
-         rectangle, so the picture has a closed form, by Lambert, which is the reference here. Brightness is irradiance, and 1 \
-         is what would arrive straight below the light with nothing in the way.",
+        "A floor, seen from above, and over it a square light and two plates that hang at different heights. \
+         The plates are the two groups: A is the left, lower one, B the right, higher one. What each hides \
+         of the light from a point of the floor is a rectangle, so the picture has a closed form, by \
+         Lambert, which is the reference here. Brightness is irradiance, and 1 is what would arrive straight \
+         below the light with nothing in the way.",
     );
     strips(page, &plates, &ways, &all[0], &reference, &places);
     // Where both plates hide all of the light.
     let core = |pixel: usize| joints[pixel].as_ref().is_some_and(|joint| joint.chances()[0] == 1.0);
     let in_core = |way: usize| short(all[0][way][0].rmse(&reference, core));
     page.prose(&format!(
-        "All forms converge to the same picture, and no estimate was clamped to make them. The noise is not where one knows it \
-         from ordinary soft shadows. Exact visibility is noisy in the penumbra only. {} adds noise elsewhere, and most of it where the \
-         floor is fully lit; but where both plates hide all of the light, which they do at {} of the {} pixels, its error with a single ray \
-         is {}: “geen variantie”, as the slides say. {} is about equally noisy wherever one looks, also in that core, where its error is {}. {} is \
-         loud where there is light, for its third term stands for nearly all of the sum and is taken a third of the time. {} always asks A, \
-         and B half of the time; its guess of V_{{B}} where A lets light through is {}, the same for the whole picture.",
+        "All forms converge to the same picture, and no estimate was clamped to make them. The noise is not \
+         where one knows it from ordinary soft shadows. Exact visibility is noisy in the penumbra only. {} \
+         adds noise elsewhere, and most of it where the floor is fully lit; but where both plates hide all \
+         of the light, which they do at {} of the {} pixels, its error with a single ray is {}: “geen \
+         variantie”, as the slides say. {} is about equally noisy wherever one looks, also in that core, \
+         where its error is {}. {} is loud where there is light, for its third term stands for nearly all of \
+         the sum and is taken a third of the time. {} always asks A, and B half of the time; its guess of \
+         V_{{B}} where A lets light through is {}, the same for the whole picture.",
         name(&forms[0]),
         (0..plates.pixels()).filter(|&pixel| core(pixel)).count(),
         plates.pixels(),
@@ -164,10 +167,12 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     }
     page.heading("Error against rays");
     let figures = [
-        "The points on the light are stratified, as this renderer does it by default (a shifted lattice). Exact visibility \
-         gains from that: its error falls faster than the root of the number of rays. The random choice of a term does not.",
-        "The points on the light are independent, as in the textbook. Now exact visibility converges no faster than the forms do, and all \
-         curves are parallel: a comparison that flatters the random forms.",
+        "The points on the light are stratified, as this renderer does it by default (a shifted lattice). \
+         Exact visibility gains from that: its error falls faster than the root of the number of rays. The \
+         random choice of a term does not.",
+        "The points on the light are independent, as in the textbook. Now exact visibility converges no \
+         faster than the forms do, and all curves are parallel: a comparison that flatters the random \
+         forms.",
     ];
     for (((pattern, _), paintings), words) in patterns.iter().zip(&all).zip(figures) {
         let mut figure = Figure::new(format!("RMSE, {pattern} light samples"), words);
@@ -211,8 +216,8 @@ fn strips(
         RAYS.map(|rays| if rays == 1 { "1 shadow ray".to_owned() } else { format!("{rays} shadow rays") });
     let mut strip = Strip::new(
         "Exact visibility and four forms, at 1 to 256 shadow rays a pixel",
-        "The frames are enlarged below each picture; under it the root mean square error over the whole of it. All pictures of a \
-         column use the same points on the light.",
+        "The frames are enlarged below each picture; under it the root mean square error over the whole of \
+         it. All pictures of a column use the same points on the light.",
         columns,
     )
     .crops(crops);
@@ -270,7 +275,8 @@ fn variance_maps(page: &mut Page, plates: &Plates, ways: &[Way], joints: &[Optio
     let most = maps.iter().flatten().copied().filter(|v| v.is_finite()).fold(0.0, f64::max);
     let mut gallery = Gallery::new(
         "Where the noise is: the variance of the visibility of one ray, in closed form",
-        "From how (V_{A}, V_{B}) is distributed over the light as seen from each point of the floor. The same colours for all.",
+        "From how (V_{A}, V_{B}) is distributed over the light as seen from each point of the floor. The \
+         same colours for all.",
     )
     .ramp(0.0, most, "variance");
     for (way, map) in ways.iter().zip(&maps) {
@@ -310,16 +316,17 @@ fn slopes(page: &mut Page, ways: &[Way], all: &[Paintings], reference: &[f64], p
     let exact = slope(&errors(&all[0][0], reference, places, Place::One));
     let balanced = slope(&errors(&all[0][2], reference, places, Place::One));
     page.prose(&format!(
-        "A slope of −1/2 means that half the error costs four times the rays. With stratified light samples exact visibility \
-         has {} in the shadow of one plate, {} has {}: however good the light samples, the choice of the term remains a throw of \
-         dice. So the more rays, the larger the distance, and the picture of one ray a pixel says little about that of 256.",
+        "A slope of −1/2 means that half the error costs four times the rays. With stratified light samples \
+         exact visibility has {} in the shadow of one plate, {} has {}: however good the light samples, the \
+         choice of the term remains a throw of dice. So the more rays, the larger the distance, and the \
+         picture of one ray a pixel says little about that of 256.",
         number(exact, 2),
         ways[2].name,
         number(balanced, 2),
     ));
     page.in_short(format!(
-        "All forms converge, with slope {} against rays where exact visibility with stratified light samples has {} (both in the shadow of one \
-         of two plates).",
+        "All forms converge, with slope {} against rays where exact visibility with stratified light samples \
+         has {} (both in the shadow of one of two plates).",
         number(balanced, 2),
         number(exact, 2),
     ));

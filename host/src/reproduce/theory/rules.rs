@@ -56,11 +56,12 @@ const FORMS: [Decomposition; 3] =
 pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     page.section("Importance sampling, and what would be better");
     page.prose(
-        "The terms need not be equally likely. The thesis traces 64 test rays from each point, estimates what each term contributes, and \
-         chooses terms in proportion. That would be right for terms that vary little; those of the first form are 0 or ±1. The \
-         least variance for given work has *p* in proportion to the root of the term’s mean square over its cost (“optimal” below). And \
-         instead of drawing a term for each ray, one can give exactly the right share of a pixel’s rays to each term (quotas), which \
-         takes the noise of the draw out.",
+        "The terms need not be equally likely. The thesis traces 64 test rays from each point, estimates \
+         what each term contributes, and chooses terms in proportion. That would be right for terms that \
+         vary little; those of the first form are 0 or ±1. The least variance for given work has *p* in \
+         proportion to the root of the term’s mean square over its cost (“optimal” below). And instead of \
+         drawing a term for each ray, one can give exactly the right share of a pixel’s rays to each term \
+         (quotas), which takes the noise of the draw out.",
     );
     let mut data = Data::new(&[
         "table",
@@ -90,7 +91,8 @@ fn closed_forms(leg: &Leg<'_>, page: &mut Page, data: &mut Data) -> Result<f64, 
         .filter(|joint| partly(joint.a_visible()) && partly(joint.chances()[1] + joint.chances()[3]))
         .collect();
     let mut table = Table::new(format!(
-        "One ray, if (V_{{A}}, V_{{B}}) were known at each point: mean over the {} points where each of the two plates hides part of the light",
+        "One ray, if (V_{{A}}, V_{{B}}) were known at each point: mean over the {} points where each of the \
+         two plates hides part of the light",
         joints.len()
     ))
     .words("form, probabilities")
@@ -150,10 +152,11 @@ fn closed_forms(leg: &Leg<'_>, page: &mut Page, data: &mut Data) -> Result<f64, 
     }
     page.add(&table);
     page.prose(&format!(
-        "For {} the thesis’ importance sampling changes the variance of one ray by a factor of {}: nothing, and not by accident. Its terms are 0 or \
-         ±1, so their mean size is their mean square, and with *p* in proportion to it the variance Σ E[s²]/p − V² comes out exactly as with \
-         equal probabilities, as long as no term is 0 for all rays. Optimal probabilities together with quotas bring variance times work to {} \
-         of that of equal ones.",
+        "For {} the thesis’ importance sampling changes the variance of one ray by a factor of {}: nothing, \
+         and not by accident. Its terms are 0 or ±1, so their mean size is their mean square, and with *p* \
+         in proportion to it the variance Σ E[s²]/p − V² comes out exactly as with equal probabilities, as \
+         long as no term is 0 for all rays. Optimal probabilities together with quotas bring variance times \
+         work to {} of that of equal ones.",
         name(&FORMS[0]),
         number(gain[0], 6),
         number(gain[1], 2),
@@ -165,13 +168,16 @@ fn closed_forms(leg: &Leg<'_>, page: &mut Page, data: &mut Data) -> Result<f64, 
 fn measured(leg: &Leg<'_>, page: &mut Page, data: &mut Data, unchanged: f64) -> Result<(), Halted> {
     let plates = two_plates(leg.run.quick);
     let reference: Vec<f64> = (0..plates.pixels()).map(|pixel| plates.reference(pixel)).collect();
-    let mut table = Table::new(format!("The two plates at {RAYS} stratified rays a pixel, with the {TEST_RAYS} test rays a point that importance sampling and optimal probabilities want"))
-        .words("form, probabilities")
-        .numbers("RMSE")
-        .numbers("plates asked a pixel")
-        .numbers("of it by test rays")
-        .numbers("error² × asked, equal = 1")
-        .numbers("time, ns a ray");
+    let mut table = Table::new(format!(
+        "The two plates at {RAYS} stratified rays a pixel, with the {TEST_RAYS} test rays a point that \
+         importance sampling and optimal probabilities want"
+    ))
+    .words("form, probabilities")
+    .numbers("RMSE")
+    .numbers("plates asked a pixel")
+    .numbers("of it by test rays")
+    .numbers("error² × asked, equal = 1")
+    .numbers("time, ns a ray");
     let exact_way = |pixel: &Pixel<'_>, _: &mut Sampler| {
         pixel.sum(|k| f64::from(u8::from(pixel.visible(0, k) && pixel.visible(1, k))))
     };
@@ -248,16 +254,18 @@ fn measured(leg: &Leg<'_>, page: &mut Page, data: &mut Data, unchanged: f64) -> 
             let [quotas, importance, optimal, both] =
                 [quotas, importance, optimal, both].map(|work| number(work, 2));
             gains.push(format!(
-                "{}: {importance} by importance, {optimal} optimal, {quotas} by quotas alone, {both} optimal with quotas",
+                "{}: {importance} by importance, {optimal} optimal, {quotas} by quotas alone, {both} optimal \
+                 with quotas",
                 name(&form)
             ));
         }
     }
     page.add(&table);
     page.prose(&format!(
-        "Test rays are not free: here they ask {} plates a pixel, where exact visibility asks {} for everything. Squared error × plates asked, with equal \
-         probabilities as 1: {}. Quotas take no tests at all, and by their closed form they can only help. The best of all these is *{}*, and has {} times \
-         the squared error × work of exact visibility.",
+        "Test rays are not free: here they ask {} plates a pixel, where exact visibility asks {} for \
+         everything. Squared error × plates asked, with equal probabilities as 1: {}. Quotas take no tests \
+         at all, and by their closed form they can only help. The best of all these is *{}*, and has {} \
+         times the squared error × work of exact visibility.",
         2 * TEST_RAYS,
         number(exact_asked, 3),
         gains.join("; "),
@@ -265,8 +273,9 @@ fn measured(leg: &Leg<'_>, page: &mut Page, data: &mut Data, unchanged: f64) -> 
         number(best.0, 3),
     ));
     page.in_short(format!(
-        "The thesis’ importance sampling changes the variance of inclusion–exclusion by a factor of {}. Of all probabilities tried on two plates the best \
-         has {} times the squared error × work of exact visibility.",
+        "The thesis’ importance sampling changes the variance of inclusion–exclusion by a factor of {}. Of \
+         all probabilities tried on two plates the best has {} times the squared error × work of exact \
+         visibility.",
         number(unchanged, 6),
         number(best.0, 3),
     ));

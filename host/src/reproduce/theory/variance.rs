@@ -13,11 +13,12 @@ const THIRDS: [f64; 3] = [1.0 / 3.0; 3];
 pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     page.section("The variance of one ray, two ways");
     page.prose(
-        "Divide what may be in the way into two groups, A and B, and let V_{A} be 1 if group A lets a ray through and 0 if \
-         not. Then the ray arrives if V = V_{A} V_{B} is 1. A product can be written as a sum, in many ways. To evaluate a \
-         sum at random one takes only one of its terms, with a probability *p*, and divides it by *p*: on average that is the \
-         sum. A term that asks for one group leaves the other one untested, which is what is saved. The price is noise, \
-         and how much of it depends on the sum.",
+        "Divide what may be in the way into two groups, A and B, and let V_{A} be 1 if group A lets a ray \
+         through and 0 if not. Then the ray arrives if V = V_{A} V_{B} is 1. A product can be written as a \
+         sum, in many ways. To evaluate a sum at random one takes only one of its terms, with a probability \
+         *p*, and divides it by *p*: on average that is the sum. A term that asks for one group leaves the \
+         other one untested, which is what is saved. The price is noise, and how much of it depends on the \
+         sum.",
     );
     page.list([
         terms(&Decomposition::InclusionExclusion),
@@ -53,8 +54,9 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
         .numbers("on the slides")
         .words("");
     let slip = table.note(
-        "The slides print half of the right number: two of the three outcomes are not 0, 3/254 and −3/254, each with \
-         probability 1/3, so the variance is (2/3)·(3/254)² = 6/254². The picture that goes with it is not affected.",
+        "The slides print half of the right number: two of the three outcomes are not 0, 3/254 and −3/254, \
+         each with probability 1/3, so the variance is (2/3)·(3/254)² = 6/254². The picture that goes with \
+         it is not affected.",
     );
     let mut worst: f64 = 0.0;
     let mut differing = 0;
@@ -118,21 +120,23 @@ pub(super) fn add(leg: &Leg<'_>, page: &mut Page) -> Result<Data, Halted> {
     }
     page.add(&table);
     page.prose(&format!(
-        "The two ways agree: of the twelve sampled variances the one that is furthest from its closed form is off by {} of its \
-         standard errors. The first form is silent where both groups block, and loudest where nothing is in the way, \
-         which in most pictures is nearly everywhere. The second has the same noise everywhere, also where there is nothing to \
-         be uncertain about. The third is nearly silent unless the light is visible, but the one term that counts asks \
-         both groups, so nothing is saved when it is taken.",
+        "The two ways agree: of the twelve sampled variances the one that is furthest from its closed form \
+         is off by {} of its standard errors. The first form is silent where both groups block, and loudest \
+         where nothing is in the way, which in most pictures is nearly everywhere. The second has the same \
+         noise everywhere, also where there is nothing to be uncertain about. The third is nearly silent \
+         unless the light is visible, but the one term that counts asks both groups, so nothing is saved \
+         when it is taken.",
         crate::page::number(worst, 2)
     ));
     page.in_short(format!(
-        "Of the slides’ variance tables all but {differing} figures are right to the last digit printed; those should be {}.",
+        "Of the slides’ variance tables all but {differing} figures are right to the last digit printed; \
+         those should be {}.",
         crate::page::number(slides::FORMS[2].form.variance(THIRDS, false, true), 3),
     ));
     if differing > 0 {
         page.prose(&format!(
-            "Of the slides’ figures {differing} differ from what follows from their own formulas, as marked; all others in the \
-             table above are right to the last digit printed."
+            "Of the slides’ figures {differing} differ from what follows from their own formulas, as marked; \
+             all others in the table above are right to the last digit printed."
         ));
     }
     averages(page);
@@ -178,8 +182,8 @@ fn averages(page: &mut Page) {
     let (time, tests) = (mean(|scene| scene.time), mean(|scene| scene.tests));
     let [fewer_tests, less_time] = slides::PLAIN_AVERAGE;
     let note = table.note(format!(
-        "The slides sum this up as {fewer_tests} % fewer intersection tests and {less_time} % less time. Their own three scenes average \
-         {} % and {} %; the second scene’s tests alone fell by {} %.",
+        "The slides sum this up as {fewer_tests} % fewer intersection tests and {less_time} % less time. \
+         Their own three scenes average {} % and {} %; the second scene’s tests alone fell by {} %.",
         crate::page::number(-tests, 3),
         crate::page::number(-time, 2),
         crate::page::number(-change(slides::PLAIN[1].tests), 3),
@@ -215,8 +219,9 @@ fn averages(page: &mut Page) {
 fn residual(leg: &Leg<'_>, page: &mut Page, data: &mut Data) -> Result<(), Halted> {
     page.heading("A form that is not on the slides");
     page.prose(&format!(
-        "{} It looks at A first, always, and goes on to B only if A lets the ray through, and then only with a chance *q*. \
-         Whatever number *u* one guesses for the rest, it is right on average; a good guess makes it quiet.",
+        "{} It looks at A first, always, and goes on to B only if A lets the ray through, and then only with \
+         a chance *q*. Whatever number *u* one guesses for the rest, it is right on average; a good guess \
+         makes it quiet.",
         terms(&Decomposition::Residual { q: 0.5, u: 1.0 })
     ));
     let mut table = Table::new("Variance of one evaluation of the residual form")
