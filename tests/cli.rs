@@ -177,7 +177,8 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["generate", "marble"], "marble"),
         (&["reproduce", "magic"], "magic"),
         (&["reproduce", "theory", "-o", &cornell], "--force"),
-        (&["reproduce", "theory", "--threads", "many"], "threads"),
+        (&["reproduce", "theory", "--threads", "99999999"], "threads"),
+        (&["reproduce", "theory", "--threads", "9999"], "1024"),
         (&["frobnicate"], "frobnicate"),
     ];
     for (args, cause) in cases {

@@ -39,8 +39,8 @@ struct TheoryArgs {
     quick: bool,
 
     /// Threads; 0 for one a core. All but the times is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T")]
-    threads: usize,
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    threads: u16,
 
     /// Seed of the random numbers.
     #[arg(long, default_value_t = 0, value_name = "S")]
@@ -64,7 +64,7 @@ pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
     let run = Run {
         quick: args.quick,
         seed: args.seed,
-        threads: args.threads,
+        threads: usize::from(args.threads),
         level,
         stop: &stop,
         watch: &progress,
