@@ -1,5 +1,6 @@
 //! The command as a user meets it: what it prints, what it writes, how it ends.
 
+use occlude_host::reproduce::theory::FILES;
 use std::path::Path;
 use std::process::{Command, Output};
 
@@ -174,6 +175,10 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["--simd", "mmx", "info"], "this CPU has"),
         (&["compare", "a.exr", "b.exr"], "a.exr"),
         (&["generate", "marble"], "marble"),
+        (&["reproduce", "magic"], "magic"),
+        (&["reproduce", "theory", "-o", &cornell], "--force"),
+        (&["reproduce", "theory", "--threads", "99999999"], "threads"),
+        (&["reproduce", "theory", "--threads", "9999"], "1024"),
         (&["frobnicate"], "frobnicate"),
     ];
     for (args, cause) in cases {
@@ -221,4 +226,104 @@ fn interrupting_keeps_what_there_is() {
     assert_eq!(done.status.code(), Some(1), "{said}");
     assert!(said.contains("interrupted after"), "{said}");
     assert!(folder.path().join("a.png").exists());
+}
+
+/// Rows of a file of data as maps from the names of its columns.
+fn rows(file: &Path) -> Vec<std::collections::HashMap<String, String>> {
+    let mut reader = csv::Reader::from_path(file).expect("a file of data");
+    reader.deserialize().map(|row| row.expect("as many cells as columns")).collect()
+}
+
+#[test]
+fn the_theory_is_reproduced() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = |threads: &str, into: &str| {
+        let done =
+            occlude(&["reproduce", "theory", "--quick", "--threads", threads, "-o", into], folder.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+        assert!(done.stdout.is_empty(), "{}", text(&done.stdout));
+        assert!(text(&done.stderr).contains("wrote"), "{}", text(&done.stderr));
+    };
+    run("1", "new/one");
+    run("3", "two");
+    let (one, two) = (folder.path().join("new/one"), folder.path().join("two"));
+
+    let count = std::fs::read_dir(&one).expect("a folder").count();
+    assert_eq!(count, 1 + FILES.len(), "the page and its data");
+    assert!(FILES.iter().all(|file| one.join(file).exists()));
+    // Everything but times is the same for any number of threads.
+    for file in ["variance.csv", "plates.csv", "halving.csv", "eight_plates.csv"] {
+        let [one, two] = [&one, &two].map(|folder| std::fs::read(folder.join(file)).expect(file));
+        assert!(one.len() > 200 && one == two, "{file}");
+    }
+    let [efficiency, again] = [&one, &two].map(|folder| rows(&folder.join("efficiency.csv")));
+    assert!(efficiency.len() > 60 && efficiency.len() == again.len());
+    for (row, again) in efficiency.iter().zip(&again) {
+        for column in ["scene", "method", "rmse", "triangle_tests_per_ray"] {
+            assert_eq!(row[column], again[column], "{column}");
+        }
+        let number = |column: &str| row[column].parse::<f64>().expect(column);
+        assert!(number("rmse") > 0.0 && number("efficiency_visibility") > 0.0, "{row:?}");
+    }
+
+    // The closed forms, the samples, and the one slip of the slides' tables.
+    let variances = rows(&one.join("variance.csv"));
+    let slips: Vec<_> = variances.iter().filter(|row| row["slides_agree"] == "no").collect();
+    assert_eq!(slips.len(), 2, "{slips:?}");
+    for row in &variances {
+        let number = |column: &str| row[column].parse::<f64>().expect(column);
+        let (closed, sampled) = (number("variance_closed_form"), number("variance_sampled"));
+        let room = 6.0 / 1.96 * number("variance_half_width_95") + 1e-5 * closed;
+        assert!((closed - sampled).abs() <= room, "{row:?}");
+        let room = 6.0 / 1.96 * number("mean_half_width_95") + 1e-6;
+        assert!((number("mean_sampled") - number("v")).abs() <= room, "{row:?}");
+    }
+    assert!(slips.iter().all(|row| row["variance_closed_form"].starts_with("9.300")), "{slips:?}");
+
+    let page = std::fs::read_to_string(one.join("index.html")).expect("a page");
+    let options = roxmltree::ParsingOptions { allow_dtd: true, ..Default::default() };
+    let document = roxmltree::Document::parse_with_options(&page, options).expect("well-formed");
+    assert!(!page.contains("NaN"), "a number is missing");
+    let count = |tag: &str| document.descendants().filter(|node| node.has_tag_name(tag)).count();
+    assert!(
+        count("section") == 5 && count("img") > 50 && count("svg") > 10,
+        "{} {}",
+        count("img"),
+        count("svg")
+    );
+    for link in
+        document.descendants().filter(|node| node.has_tag_name("a")).filter_map(|node| node.attribute("href"))
+    {
+        assert!(link.starts_with('#') || one.join(link).exists(), "{link}");
+    }
+
+    // Its own page is replaced, anything else is not.
+    let foreign = folder.path().join("foreign");
+    std::fs::create_dir(&foreign).expect("a folder");
+    std::fs::write(foreign.join("index.html"), "mine").expect("a file");
+    let done = occlude(&["reproduce", "theory", "--quick", "-o", "foreign"], folder.path());
+    assert_eq!(done.status.code(), Some(2), "{}", text(&done.stderr));
+    assert_eq!(std::fs::read_to_string(foreign.join("index.html")).expect("still there"), "mine");
+    let stopped = occlude(&["reproduce", "theory", "-o", "two/index.html"], folder.path());
+    assert_eq!(stopped.status.code(), Some(2), "{}", text(&stopped.stderr));
+}
+
+#[cfg(unix)]
+#[test]
+fn an_interrupted_reproduction_leaves_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let child = Command::new(PROGRAM)
+        .args(["reproduce", "theory", "-o", "a/b"])
+        .current_dir(folder.path())
+        .stderr(std::process::Stdio::piped())
+        .spawn()
+        .expect("it starts");
+    std::thread::sleep(std::time::Duration::from_millis(1500));
+    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    assert!(killed.success());
+    let done = child.wait_with_output().expect("it ends");
+    let said = text(&done.stderr);
+    assert_eq!(done.status.code(), Some(1), "{said}");
+    assert!(said.contains("nothing was written"), "{said}");
+    assert!(!folder.path().join("a").exists());
 }

@@ -10,8 +10,10 @@ pub mod light;
 pub mod mesh;
 pub mod metrics;
 pub mod output;
+pub mod page;
 pub mod render;
 pub mod report;
+pub mod reproduce;
 pub mod sampler;
 pub mod scene;
 

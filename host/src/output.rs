@@ -95,6 +95,18 @@ pub fn check_writable(path: impl AsRef<Path>) -> Result<()> {
     Destination::of(path.as_ref())?.check()
 }
 
+/// An image as a PNG in memory, for pages that hold their pictures: as [`write()`] writes it, but with one channel
+/// if it has no colours. `None` if it has no pixels.
+pub fn png(image: &Image, exposure_ev: f32) -> Option<Vec<u8>> {
+    let grey = image.pixels.iter().all(|[r, g, b]| r == g && g == b);
+    if grey {
+        let bytes = screen(image.pixels.iter().map(|[r, _, _]| r), exposure_ev);
+        png_of(image, &bytes, image::ExtendedColorType::L8).ok()
+    } else {
+        encode_png(image, exposure_ev).ok()
+    }
+}
+
 /// Writes a file of any kind as [`write()`] writes images: whole or not at all.
 pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
     Destination::of(path.as_ref())?.save(bytes)
@@ -219,20 +231,19 @@ fn folder(file: &Path) -> &Path {
 }
 
 fn encode_png(image: &Image, exposure_ev: f32) -> image::ImageResult<Vec<u8>> {
+    let bytes = screen(image.pixels.as_flattened().iter(), exposure_ev);
+    png_of(image, &bytes, image::ExtendedColorType::Rgb8)
+}
+
+/// 8 bits each, sRGB, after an exposure.
+fn screen<'a>(linear: impl Iterator<Item = &'a f32>, exposure_ev: f32) -> Vec<u8> {
     let scale = exposure_ev.exp2();
-    let bytes: Vec<u8> = image
-        .pixels
-        .as_flattened()
-        .iter()
-        .map(|&linear| (srgb_encode(linear * scale) * 255.0).round() as u8)
-        .collect();
+    linear.map(|&linear| (srgb_encode(linear * scale) * 255.0).round() as u8).collect()
+}
+
+fn png_of(image: &Image, bytes: &[u8], colour: image::ExtendedColorType) -> image::ImageResult<Vec<u8>> {
     let mut file = Vec::new();
-    image::codecs::png::PngEncoder::new(&mut file).write_image(
-        &bytes,
-        image.width,
-        image.height,
-        image::ExtendedColorType::Rgb8,
-    )?;
+    image::codecs::png::PngEncoder::new(&mut file).write_image(bytes, image.width, image.height, colour)?;
     Ok(file)
 }
 

@@ -4,12 +4,15 @@ pub mod compare;
 pub mod generate;
 pub mod info;
 pub mod render;
+pub mod reproduce;
 
 use crate::error::{Error, Result};
 use clap::{Parser, Subcommand};
 use occlude_kernel::lanes::{Level, detect, level_name, level_named, levels};
 use std::io::Write;
 use std::process::ExitCode;
+use std::sync::Arc;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Soft shadows from area lights.
 #[derive(Debug, Parser)]
@@ -33,6 +36,8 @@ enum Command {
     Compare(compare::CompareArgs),
     /// Write a scene of any size.
     Generate(generate::GenerateArgs),
+    /// Run the tables and figures of stochastic visibility again, and write a page of them.
+    Reproduce(reproduce::ReproduceArgs),
 }
 
 /// A SIMD level of this CPU.
@@ -64,6 +69,7 @@ pub fn run() -> ExitCode {
         Command::Info(args) => info::run(args, level).map(|()| Ended::Done),
         Command::Compare(args) => compare::run(args).map(|()| Ended::Done),
         Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
+        Command::Reproduce(args) => reproduce::run(args, level),
     };
     match ended {
         Ok(Ended::Done) => ExitCode::SUCCESS,
@@ -74,6 +80,21 @@ pub fn run() -> ExitCode {
             ExitCode::from(2)
         }
     }
+}
+
+/// What Ctrl-C sets. A second Ctrl-C does not wait. `what` would be lost if the system refused.
+pub fn interruptible(what: &str) -> Arc<AtomicBool> {
+    let stop = Arc::new(AtomicBool::new(false));
+    let asked = Arc::clone(&stop);
+    let handled = ctrlc::set_handler(move || {
+        if asked.swap(true, Ordering::Relaxed) {
+            std::process::exit(1);
+        }
+    });
+    if let Err(error) = handled {
+        note(&format!("warning: Ctrl-C will lose {what}: {error}"));
+    }
+    stop
 }
 
 /// Prints to standard output. A reader that has gone away is no error: `occlude info | head`.

@@ -16,8 +16,6 @@ use occlude_kernel::Bvh;
 use occlude_kernel::lanes::{Level, level_name};
 use std::io::IsTerminal;
 use std::path::PathBuf;
-use std::sync::Arc;
-use std::sync::atomic::{AtomicBool, Ordering};
 use std::time::{Duration, Instant};
 
 /// Arguments of `occlude render`.
@@ -305,18 +303,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         count: args.stats.is_some(),
     };
 
-    let stop = Arc::new(AtomicBool::new(false));
-    let asked = Arc::clone(&stop);
-    // A second Ctrl-C does not wait.
-    let handled = ctrlc::set_handler(move || {
-        if asked.swap(true, Ordering::Relaxed) {
-            std::process::exit(1);
-        }
-    });
-    if let Err(error) = handled {
-        note(&format!("warning: Ctrl-C will lose the picture: {error}"));
-    }
-
+    let stop = super::interruptible("the picture");
     let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
     let limits = Limits { passes: args.spp, time: args.time_limit };
     let rendered = render(&stage, &*method, size, limits, args.threads, &stop, |pass| progress.passed(pass))?;

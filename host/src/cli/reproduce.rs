@@ -1,0 +1,144 @@
+//! `occlude reproduce`: tables and figures, run again.
+
+use super::{Ended, note};
+use crate::error::Result;
+use crate::page::{Folder, INDEX};
+use crate::reproduce::theory::{self, theory};
+use crate::reproduce::{Halted, Run, Watch};
+use clap::{Args, Subcommand};
+use indicatif::{ProgressBar, ProgressStyle};
+use occlude_kernel::lanes::Level;
+use std::io::IsTerminal;
+use std::path::PathBuf;
+use std::sync::Mutex;
+use std::time::{Duration, Instant};
+
+/// Arguments of `occlude reproduce`.
+#[derive(Debug, Args)]
+pub struct ReproduceArgs {
+    #[command(subcommand)]
+    what: What,
+}
+
+#[derive(Debug, Subcommand)]
+enum What {
+    /// Stochastic visibility: variances, pictures and efficiency of every decomposition, as a page.
+    ///
+    /// Everything on it is run anew. Takes some minutes; nothing but this program is needed.
+    Theory(TheoryArgs),
+}
+
+#[derive(Debug, Args)]
+struct TheoryArgs {
+    /// The folder to write index.html and the .csv files to.
+    #[arg(short, long, value_name = "FOLDER", default_value = "theory")]
+    output: PathBuf,
+
+    /// Smaller pictures and fewer samples: seconds, not minutes.
+    #[arg(long)]
+    quick: bool,
+
+    /// Threads; 0 for one a core. All but the times is the same for any number.
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    threads: u16,
+
+    /// Seed of the random numbers.
+    #[arg(long, default_value_t = 0, value_name = "S")]
+    seed: u64,
+
+    /// Write to the folder whatever is in it.
+    #[arg(long)]
+    force: bool,
+
+    /// Print nothing but errors.
+    #[arg(short, long)]
+    quiet: bool,
+}
+
+/// Runs the command.
+pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
+    let What::Theory(args) = &args.what;
+    let folder = Folder::claim(&args.output, theory::MAKER, &theory::FILES, args.force)?;
+    let stop = super::interruptible("the page");
+    let progress = Progress::new(args.quiet);
+    let run = Run {
+        quick: args.quick,
+        seed: args.seed,
+        threads: usize::from(args.threads),
+        level,
+        stop: &stop,
+        watch: &progress,
+    };
+    let reproduced = match theory(&run) {
+        Ok(reproduced) => reproduced,
+        Err(Halted::Failed(error)) => return Err(error),
+        Err(Halted::Interrupted) => {
+            progress.finish();
+            if !args.quiet {
+                note("interrupted; nothing was written");
+            }
+            return Ok(Ended::Interrupted);
+        }
+    };
+    progress.finish();
+    for (name, data) in &reproduced.data {
+        folder.write(name, &data.csv())?;
+    }
+    folder.write(INDEX, reproduced.page.html(&reproduced.foot).as_bytes())?;
+    if !args.quiet {
+        note(&format!("wrote {} and {} files of data", folder.file(INDEX).display(), reproduced.data.len()));
+    }
+    Ok(Ended::Done)
+}
+
+/// A bar on a terminal, a line a step in a pipe.
+enum Progress {
+    Quiet,
+    Bar(ProgressBar),
+    Lines { start: Instant, last: Mutex<String> },
+}
+
+/// Steps of the bar.
+const STEPS: f64 = 1000.0;
+
+impl Progress {
+    fn new(quiet: bool) -> Self {
+        if quiet {
+            return Self::Quiet;
+        }
+        if !std::io::stderr().is_terminal() {
+            return Self::Lines { start: Instant::now(), last: Mutex::default() };
+        }
+        let bar = ProgressBar::new(STEPS as u64);
+        if let Ok(style) = ProgressStyle::with_template("{bar:30} {percent:>3}%  {elapsed}, {wide_msg}") {
+            bar.set_style(style);
+        }
+        bar.enable_steady_tick(Duration::from_millis(200));
+        Self::Bar(bar)
+    }
+
+    fn finish(&self) {
+        if let Self::Bar(bar) = self {
+            bar.finish_and_clear();
+        }
+    }
+}
+
+impl Watch for Progress {
+    fn reached(&self, done: f64, next: &str) {
+        match self {
+            Self::Quiet => {}
+            Self::Bar(bar) => {
+                bar.set_position((done * STEPS) as u64);
+                bar.set_message(next.to_owned());
+            }
+            Self::Lines { start, last } => {
+                let mut last = last.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+                if *last != next {
+                    *last = next.to_owned();
+                    note(&format!("{:3.0} %, {:.1} s: {next}", 100.0 * done, start.elapsed().as_secs_f64()));
+                }
+            }
+        }
+    }
+}
