@@ -8,9 +8,10 @@
 use clap::Parser;
 use occlude_benches::ours::{METHODS, Method};
 use occlude_benches::record::{Cell, Record, SceneRow};
+use occlude_benches::scaling::{self, Sample};
 use occlude_benches::{Class, OWN, SHARED, Setting, Work, median, obvhs, scene, thread_time};
 use occlude_host::accel::{Accel, Quality};
-use occlude_host::generate::Kind;
+use occlude_host::generate::{Kind, generate};
 use occlude_kernel::Counts;
 use occlude_kernel::lanes::{Level, detect, level_name, level_named};
 use std::path::PathBuf;
@@ -38,6 +39,10 @@ struct Options {
     /// Only all points together, not the classes apart.
     #[arg(long)]
     overall: bool,
+    /// Instead of scenes one by one, time a ray against the number of triangles, 10^3 to 10^MOST, in generated
+    /// spheres and cities at 16 rays a point and light; with -o writes NAME.csv and NAME.svg.
+    #[arg(long, value_name = "MOST", value_parser = clap::value_parser!(u32).range(3..=8))]
+    scaling: Option<u32>,
     /// Also print how many tests our queries make.
     #[arg(long)]
     counts: bool,
@@ -62,6 +67,10 @@ fn main() {
             std::process::exit(2);
         }),
     };
+    if let Some(most) = options.scaling {
+        scale(&options, level, most);
+        return;
+    }
     let mut names = options.scenes.clone();
     if names.is_empty() {
         let made = Kind::ALL.into_iter().map(Kind::name);
@@ -81,6 +90,69 @@ fn main() {
     print!("{}", record.summary());
     if let Some(path) = &options.output {
         record.write(path).unwrap_or_else(|error| {
+            eprintln!("{}: {error}", path.display());
+            std::process::exit(2);
+        });
+    }
+}
+
+/// Time a ray from 10^3 to 10^most triangles.
+fn scale(options: &Options, level: Level, most: u32) {
+    let mut samples = Vec::new();
+    for kind in [Kind::Spheres, Kind::City] {
+        for power in 3..=most {
+            let start = Instant::now();
+            let setting = Setting::new(kind.name(), generate(kind, 1, 10usize.pow(power)), options.points);
+            let triangles = setting.scene.triangles.len();
+            eprintln!(
+                "{}, {triangles} triangles: ready after {:.1} s",
+                setting.name,
+                start.elapsed().as_secs_f64()
+            );
+            let start = Instant::now();
+            drop(Accel::build(&setting.scene, Quality::default()));
+            let build = start.elapsed().as_secs_f64();
+            let bvh = setting.bvh();
+            #[cfg(feature = "embree")]
+            let tree = occlude_benches::embree::Embree::new(&setting.scene, false);
+            let mut peers: Vec<Peer<'_>> = METHODS
+                .iter()
+                .map(|&Method { name, answer, .. }| Peer {
+                    name: name.to_owned(),
+                    family: "ours",
+                    answer: Box::new(move |work, blocked| answer(level, bvh, work, blocked)),
+                })
+                .collect();
+            #[cfg(feature = "embree")]
+            if let Some(tree) = &tree {
+                for mode in occlude_benches::embree::MODES.into_iter().filter(|mode| !mode.robust) {
+                    let answer = Box::new(move |work: &Work, blocked: &mut [u64]| {
+                        tree.answer(mode, level, work, blocked)
+                    });
+                    peers.push(Peer { name: mode.name.to_owned(), family: "embree", answer });
+                }
+            }
+            let cells = contest(&peers, &setting.work(16, None), options.runs);
+            let each = triangles as f64;
+            let (kind, bytes) = (setting.name.clone(), setting.bytes() as f64 / each);
+            if let Some(cell) = cells.iter().find(|cell| cell.peer == "tile") {
+                samples.push(Sample { kind, peer: "ours", triangles, ns: cell.ns_per_ray(), build, bytes });
+            }
+            #[cfg(feature = "embree")]
+            if let Some(tree) = &tree {
+                let best = cells.iter().filter(|cell| cell.family == "embree").map(|cell| cell.ns_per_ray());
+                let (ns, build) = (best.fold(f64::INFINITY, f64::min), tree.built.as_secs_f64());
+                let (kind, bytes) = (setting.name.clone(), tree.tree_bytes() as f64 / each);
+                samples.push(Sample { kind, peer: "embree", triangles, ns, build, bytes });
+            }
+        }
+    }
+    print!("{}", scaling::csv(&samples));
+    if let Some(path) = &options.output {
+        let title = "16 shadow rays a point and light, one thread; Embree: the best of its modes";
+        let written = std::fs::write(path.with_extension("csv"), scaling::csv(&samples))
+            .and_then(|()| std::fs::write(path.with_extension("svg"), scaling::svg(&samples, title)));
+        written.unwrap_or_else(|error| {
             eprintln!("{}: {error}", path.display());
             std::process::exit(2);
         });

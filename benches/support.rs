@@ -25,6 +25,8 @@ pub mod ours;
 pub mod pack;
 #[path = "support/record.rs"]
 pub mod record;
+#[path = "support/scaling.rs"]
+pub mod scaling;
 
 /// What is asked: batches of shadow rays, each from a point to samples of a light.
 #[derive(Clone, Debug, Default)]

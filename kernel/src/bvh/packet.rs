@@ -345,9 +345,13 @@ impl<S: Simd> Bvh<'_, S> {
         let along_y = active & !along_x & z.le(y).bits();
         let along_z = active & !along_x & !along_y;
 
-        let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
-        let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
-        let slabs = PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
+        let slabs = if start.has_boxes() {
+            let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
+            let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
+            PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack)
+        } else {
+            PacketSlabs::nothing(token)
+        };
         let mut axis = 0;
         while axis < 3 {
             let active = [along_x, along_y, along_z][axis];
@@ -547,6 +551,12 @@ pub(super) struct Start<'c> {
 }
 
 impl Start<'_> {
+    /// Whether there are boxes to test and not only triangles.
+    #[inline(always)]
+    fn has_boxes(&self) -> bool {
+        self.root || !self.nodes.is_empty() || !self.entries.is_empty()
+    }
+
     /// At the root.
     pub(super) const ROOT: Start<'static> =
         Start { root: true, blocks: &[], nodes: &[], entries: &[], shift: 0 };

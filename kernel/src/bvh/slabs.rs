@@ -139,6 +139,13 @@ pub(super) struct PacketSlabs<L> {
 }
 
 impl<L: Lanes> PacketSlabs<L> {
+    /// For packets that test no boxes.
+    #[inline(always)]
+    pub(super) fn nothing(token: L::Token) -> Self {
+        let zero = [L::splat(token, 0.0); 3];
+        Self { inverse: zero, near: zero, far: zero, t_min: zero[0], near_side: None }
+    }
+
     #[inline(always)]
     pub(super) fn new(
         token: L::Token,
