@@ -51,11 +51,13 @@ struct Options {
     output: Option<PathBuf>,
 }
 
+type Answer<'a> = Box<dyn Fn(&Work, &mut [u64]) + 'a>;
+
 /// Somebody who answers all of some work: a word a batch.
 struct Peer<'a> {
     name: String,
     family: &'static str,
-    answer: Box<dyn Fn(&Work, &mut [u64]) + 'a>,
+    answer: Answer<'a>,
 }
 
 fn main() {

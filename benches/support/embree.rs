@@ -249,6 +249,7 @@ impl<const W: usize> Rays<W> {
         }
     }
 
+    #[allow(clippy::needless_range_loop, reason = "several arrays side by side")]
     #[inline(always)]
     fn fill(&mut self, origin: Vec3, targets: [&[f32; W]; 3]) {
         let origin = origin.to_array();

@@ -109,6 +109,7 @@ impl<S: Simd, C: Counter> Tracer<{ RayPacket::WIDTH }> for PacketTracer<'_, S, C
         RayPacket { t_max: [1.0; RayPacket::WIDTH], ..RayPacket::default() }
     }
 
+    #[allow(clippy::needless_range_loop, reason = "several arrays side by side")]
     #[inline(always)]
     fn fill(packet: &mut RayPacket, origin: Vec3, targets: [&[f32; RayPacket::WIDTH]; 3]) {
         let origin = origin.to_array();

@@ -50,7 +50,7 @@ fn groups(questions: &Questions) -> Vec<Group> {
     let whole = questions.weights.len() < FEW * batches.len();
     let part = |pixel: u32| {
         let (x, y) = (pixel % width.max(&1), pixel / width.max(&1));
-        if whole { 0 } else { (y / PART) << 16 | x / PART }
+        if whole { 0 } else { ((y / PART) << 16) | (x / PART) }
     };
     let place = |batch: &super::Batch| (batch.light, part(points[batch.point as usize].pixel));
     let mut order: Vec<_> = batches.iter().map(|batch| (place(batch), batch)).collect();

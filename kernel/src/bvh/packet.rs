@@ -490,6 +490,7 @@ impl<S: Simd> Bvh<'_, S> {
         }
     }
 
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn meet_node<V: PacketVisitor<S::Packet>>(
         &self,

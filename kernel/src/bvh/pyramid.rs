@@ -873,6 +873,7 @@ impl<S: Simd> Bvh<'_, S> {
     }
 
     /// Puts the children of a node that may block any of `ask` on the stack, the nearest on top.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     pub(super) fn push_children(
         &self,

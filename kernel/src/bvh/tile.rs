@@ -179,7 +179,7 @@ impl List {
             // The last full one takes its place, and the one with room, if any, that one's.
             let full = self.count / TriangleBlock::WIDTH - 1;
             (self.blocks[k], self.scores[k]) = (self.blocks[full], self.scores[full]);
-            if self.count % TriangleBlock::WIDTH != 0 {
+            if !self.count.is_multiple_of(TriangleBlock::WIDTH) {
                 (self.blocks[full], self.scores[full]) = (self.blocks[full + 1], self.scores[full + 1]);
             }
             self.count -= TriangleBlock::WIDTH;
