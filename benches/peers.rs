@@ -12,8 +12,8 @@ use occlude_benches::scaling::{self, Sample};
 use occlude_benches::{Class, OWN, SHARED, Setting, Work, median, obvhs, scene, thread_time};
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::generate::{Kind, generate};
-use occlude_kernel::Counts;
 use occlude_kernel::lanes::{Level, detect, level_name, level_named};
+use occlude_kernel::{Bvh, Counts};
 use std::path::PathBuf;
 use std::time::Instant;
 
@@ -117,14 +117,7 @@ fn scale(options: &Options, level: Level, most: u32) {
             let bvh = setting.bvh();
             #[cfg(feature = "embree")]
             let tree = occlude_benches::embree::Embree::new(&setting.scene, false);
-            let mut peers: Vec<Peer<'_>> = METHODS
-                .iter()
-                .map(|&Method { name, answer, .. }| Peer {
-                    name: name.to_owned(),
-                    family: "ours",
-                    answer: Box::new(move |work, blocked| answer(level, bvh, work, blocked)),
-                })
-                .collect();
+            let mut peers = ours(level, bvh);
             #[cfg(feature = "embree")]
             if let Some(tree) = &tree {
                 for mode in occlude_benches::embree::MODES.into_iter().filter(|mode| !mode.robust) {
@@ -161,6 +154,18 @@ fn scale(options: &Options, level: Level, most: u32) {
     }
 }
 
+/// Our queries.
+fn ours(level: Level, bvh: Bvh<'_>) -> Vec<Peer<'_>> {
+    METHODS
+        .iter()
+        .map(|&Method { name, answer, .. }| Peer {
+            name: name.to_owned(),
+            family: "ours",
+            answer: Box::new(move |work, blocked| answer(level, bvh, work, blocked)),
+        })
+        .collect()
+}
+
 fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Record) {
     let bvh = setting.bvh();
     let mut row = SceneRow {
@@ -182,14 +187,7 @@ fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Reco
     let (binary, wide) = (obvhs::Binary::new(&setting.scene), obvhs::Wide::new(&setting.scene));
     #[cfg(feature = "embree")]
     let trees = [false, true].map(|robust| occlude_benches::embree::Embree::new(&setting.scene, robust));
-    let mut peers: Vec<Peer<'_>> = METHODS
-        .iter()
-        .map(|&Method { name, answer, .. }| Peer {
-            name: name.to_owned(),
-            family: "ours",
-            answer: Box::new(move |work, blocked| answer(level, bvh, work, blocked)),
-        })
-        .collect();
+    let mut peers = ours(level, bvh);
     let answer = Box::new(|work: &Work, blocked: &mut [u64]| binary.answer(work, blocked));
     peers.push(Peer { name: "obvhs binary".to_owned(), family: "obvhs", answer });
     let answer = Box::new(|work: &Work, blocked: &mut [u64]| wide.answer(work, blocked));

@@ -40,9 +40,6 @@ const CELLS: usize = 32;
 /// Nodes visited before boxes are asked which targets they may hide: in easy places there is nothing to gain.
 const EASY: u32 = 3;
 
-/// As many targets or fewer are traced one by one.
-const LONE: u32 = 2;
-
 /// A block is tested ray by ray for as many targets or fewer.
 const LEAF_LONE: u32 = 3;
 
@@ -814,16 +811,6 @@ impl<S: Simd> Bvh<'_, S> {
                     let blocked =
                         self.block_blocked(pyramid, block, &mut going.forms, ask, part, counter, learner);
                     going.free &= !blocked;
-                }
-            } else if ask.count_ones() <= LONE && going.visits > EASY {
-                let mut rest = ask;
-                while rest != 0 {
-                    let i = rest.trailing_zeros() as usize;
-                    rest &= rest - 1;
-                    let (ray, axis) = (pyramid.ray(i), pyramid.axis(i));
-                    if self.blocker_below(next, &ray, axis, part, counter).is_some() {
-                        going.free &= !(1 << i);
-                    }
                 }
             } else {
                 self.push_children(pyramid, &self.nodes[next.index()], ask, stack, going, part, counter);

@@ -213,22 +213,7 @@ impl<S: Simd> Bvh<'_, S> {
         self.traverse_below(Child::node(0), ray, axis, part, counter, visitor);
     }
 
-    /// Which triangle of the part in this subtree blocks a ray that can hit something, if any does?
-    #[inline(always)]
-    pub(super) fn blocker_below(
-        &self,
-        subtree: Child,
-        ray: &Ray,
-        axis: usize,
-        part: impl Part,
-        counter: &mut impl Counter,
-    ) -> Option<Place> {
-        let slabs = Slabs::<S::Node>::new(self.simd.token(), ray, self.slack(ray.origin));
-        let sheared = shear_one(self.simd, ray, axis);
-        self.blocker_of(subtree, &slabs, &sheared, ray.t_max, part, counter)
-    }
-
-    /// The same for a ray made ready.
+    /// Which triangle of the part in this subtree blocks a ray made ready, if any does?
     #[inline(always)]
     pub(super) fn blocker_of(
         &self,
