@@ -50,8 +50,8 @@ pub struct RenderArgs {
     quality: Quality,
 
     /// Threads; 0 for one a core. The image is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T")]
-    threads: usize,
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    threads: u16,
 
     /// Seed of the random numbers.
     #[arg(long, default_value_t = 0, value_name = "S")]
@@ -306,7 +306,8 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let stop = super::interruptible("the picture");
     let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
     let limits = Limits { passes: args.spp, time: args.time_limit };
-    let rendered = render(&stage, &*method, size, limits, args.threads, &stop, |pass| progress.passed(pass))?;
+    let rendered =
+        render(&stage, &*method, size, limits, args.threads.into(), &stop, |pass| progress.passed(pass))?;
     progress.finish();
 
     let image = rendered.film.develop();
@@ -325,7 +326,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         size: [size.0, size.1],
         spp: rendered.passes,
         shadow_rays: args.shadow_rays,
-        threads: if args.threads == 0 { rayon::current_num_threads() } else { args.threads },
+        threads: if args.threads == 0 { rayon::current_num_threads() } else { args.threads.into() },
         seed: args.seed,
         simd: level_name(level).to_owned(),
         interrupted: rendered.interrupted,
