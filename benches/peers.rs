@@ -117,6 +117,7 @@ fn scale(options: &Options, level: Level, most: u32) {
             let bvh = setting.bvh();
             #[cfg(feature = "embree")]
             let tree = occlude_benches::embree::Embree::new(&setting.scene, false);
+            #[cfg_attr(not(feature = "embree"), expect(unused_mut, reason = "nobody to add"))]
             let mut peers = ours(level, bvh);
             #[cfg(feature = "embree")]
             if let Some(tree) = &tree {
