@@ -27,6 +27,7 @@
 pub mod bvh;
 pub mod counter;
 pub mod lanes;
+pub mod photons;
 pub mod polygon;
 pub mod ray;
 pub mod triangle;
@@ -35,5 +36,6 @@ mod vec3x;
 pub use bvh::{BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Targets, offset};
 pub use counter::{Counter, Counts, Uncounted};
 pub use lanes::{Native, Scalar, Simd};
+pub use photons::{LightPhoton, OcclusionPhoton, PhotonMap};
 pub use ray::{Hit, Ray, RayPacket};
 pub use triangle::{NO_TRIANGLE, TriangleBlock};

@@ -1,10 +1,11 @@
 //! One point and many points on a light: which of the segments are blocked?
 
-use super::Bvh;
 use super::packet::{Any, Rays};
 use super::pyramid::{MOST, NO_STACK, Pyramid, Stack};
+use super::{Bvh, Child};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
+use crate::ray::Ray;
 use crate::vec3x;
 use glam::Vec3;
 
@@ -154,10 +155,64 @@ impl<S: Simd> Bvh<'_, S> {
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
                 self.packets_blocked(x, targets, from, count, ignore, counter)
             } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
-                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, ignore, counter)
+                counter.rays(count as u32);
+                let BatchScratch { pyramid, stack } = scratch;
+                self.pyramid_blocked(pyramid, stack, Child::node(0), u64::MAX, ignore, counter)
             } else {
                 self.packets_blocked(x, targets, from, count, ignore, counter)
             };
+            from += MOST;
+        }
+    }
+
+    /// The same, but only the triangles below these subtrees count: blockers that may be in the way, named by
+    /// whoever knows. Costs a traversal of each, until nothing is left to hide.
+    ///
+    /// Panics if one of them is beyond the tree's nodes or blocks.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    pub fn occluded_batch_by(
+        &self,
+        subtrees: &[Child],
+        x: impl Into<[f32; 3]>,
+        targets: &Targets<'_>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        scratch: &mut BatchScratch,
+        blocked: &mut [u64],
+    ) {
+        let x = x.into();
+        let mut from = 0;
+        while from < targets.len() {
+            let count = (targets.len() - from).min(MOST);
+            let every = u64::MAX >> (64 - count);
+            let mut free = every;
+            counter.rays(count as u32);
+            let aimed = count >= FEW
+                && scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude);
+            let mut next = 0;
+            while next < subtrees.len() && free != 0 {
+                let subtree = subtrees[next];
+                next += 1;
+                if subtree == Child::NONE {
+                    continue;
+                }
+                if aimed {
+                    let BatchScratch { pyramid, stack } = &mut *scratch;
+                    free &= !self.pyramid_blocked(pyramid, stack, subtree, free, ignore, counter);
+                } else {
+                    let mut ask = free;
+                    while ask != 0 {
+                        let i = ask.trailing_zeros() as usize;
+                        ask &= ask - 1;
+                        let ray = Ray::segment(x, targets.get(from + i));
+                        if self.occluded_from(subtree, &ray, ignore, counter) {
+                            free &= !(1 << i);
+                        }
+                    }
+                }
+            }
+            blocked[from / MOST] = every & !free;
             from += MOST;
         }
     }

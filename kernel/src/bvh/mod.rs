@@ -5,6 +5,7 @@
 //! | is anything there? | [`Bvh::occluded`] | [`Bvh::occluded_packet`] | [`Bvh::occluded_batch`] |
 //! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | |
 //! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | |
+//! | is one of these there? | | | [`Bvh::occluded_batch_by`] |
 //! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | |
 //!
 //! Every one gives the answer of a loop over all triangles with the test of [`crate::triangle`]: boxes are
@@ -213,6 +214,14 @@ impl<'a, S: Simd> Bvh<'a, S> {
     #[inline(always)]
     pub fn on<T: Simd>(&self, simd: T) -> Bvh<'a, T> {
         Bvh { nodes: self.nodes, blocks: self.blocks, magnitude: self.magnitude, simd }
+    }
+
+    /// Blocks of some of this tree's triangles, with no nodes above them, to ask by [`Bvh::occluded_batch_by`].
+    ///
+    /// Their vertices must be among those of the tree; others may be missed, or hit from too near.
+    #[inline(always)]
+    pub fn with_blocks<'b>(&self, blocks: &'b [TriangleBlock]) -> Bvh<'b, S> {
+        Bvh { nodes: &[], blocks, magnitude: self.magnitude, simd: self.simd }
     }
 
     /// The nodes.

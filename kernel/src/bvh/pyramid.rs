@@ -730,20 +730,21 @@ fn greatest_of<L: Lanes>(v: L) -> f32 {
 }
 
 impl<S: Simd> Bvh<'_, S> {
-    /// Which of the pyramid's targets anything but `ignore` blocks.
+    /// Which of the pyramid's targets `among` these anything but `ignore` below `subtree` blocks.
     #[inline(always)]
     pub(super) fn pyramid_blocked(
         &self,
         pyramid: &mut Pyramid,
         stack: &mut Stack,
+        subtree: Child,
+        among: u64,
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
         let simd = self.simd;
         let token = simd.token();
-        let every = u64::MAX >> (64 - pyramid.count);
+        let every = among & (u64::MAX >> (64 - pyramid.count));
         let mut free = every;
-        counter.rays(pyramid.count as u32);
         let mut forms = Forms {
             edges: [[[0.0; 8]; 3]; 3],
             volume: [0.0; 8],
@@ -753,7 +754,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut found = Found::NOTHING;
         let mut len = 0;
         let (mut visits, mut sorted) = (0, false);
-        let (mut next, mut may) = (Child::node(0), every);
+        let (mut next, mut may) = (subtree, every);
         let mut depth = [0.0; 8];
         let mut hides = [every; 8];
         loop {

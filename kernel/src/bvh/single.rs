@@ -203,6 +203,22 @@ impl<S: Simd> Bvh<'_, S> {
         self.traverse_below(Child::node(0), ray, axis, ignore, counter, visitor);
     }
 
+    /// Does anything but `ignore` in this subtree block the ray?
+    #[inline(always)]
+    pub(super) fn occluded_from(
+        &self,
+        subtree: Child,
+        ray: &Ray,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> bool {
+        let Some(axis) = dominant_axis(ray.origin, ray.direction) else {
+            return false;
+        };
+        ray.direction.abs().max_element() >= SHORTEST
+            && self.occluded_below(subtree, ray, axis, ignore, counter)
+    }
+
     /// Does anything but `ignore` in this subtree block a ray that can hit something?
     #[inline(always)]
     pub(super) fn occluded_below(
