@@ -10,6 +10,7 @@ pub mod light;
 pub mod mesh;
 pub mod metrics;
 pub mod output;
+pub mod photons;
 pub mod render;
 pub mod report;
 pub mod sampler;

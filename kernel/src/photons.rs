@@ -182,7 +182,8 @@ impl Place {
     /// The square of the radius; negative, so that nothing is near, if that is negative or NaN.
     #[inline(always)]
     fn reach(&self) -> f32 {
-        if self.radius >= 0.0 { self.radius * self.radius } else { -1.0 }
+        // Never infinite, so that what is at infinity is not near.
+        if self.radius >= 0.0 { (self.radius * self.radius).min(f32::MAX) } else { -1.0 }
     }
 
     /// The squared distance of a point, by the operations the lanes do.
@@ -335,20 +336,25 @@ impl<'a, S: Simd> Photons<'a, S> {
         if light == 0 {
             return Class::Dark;
         }
-        let (mut len, mut dropped) = (0, 0);
+        // Sorted and without repetition are the first `neat` of the names.
+        let (mut len, mut neat, mut dropped) = (0, 0, 0);
         for neighbour in found {
             if neighbour.id().is_light() {
                 continue;
             }
             let photon = &self.occlusion[neighbour.id().index()];
-            let names = &self.blockers[photon.first as usize..(photon.first + photon.len) as usize];
-            if names.len() > room.len() - len {
-                len = distinct(&mut room[..len]);
+            for &name in &self.blockers[photon.first as usize..(photon.first + photon.len) as usize] {
+                if len == room.len() && neat < len {
+                    len = distinct(&mut room[..len]);
+                    neat = len;
+                }
+                if len < room.len() {
+                    room[len] = name;
+                    len += 1;
+                } else if room[..len].binary_search(&name).is_err() {
+                    dropped += 1;
+                }
             }
-            let fit = names.len().min(room.len() - len);
-            room[len..len + fit].copy_from_slice(&names[..fit]);
-            len += fit;
-            dropped += names.len() - fit;
         }
         len = distinct(&mut room[..len]);
         Class::Penumbra(Blockers { list: &room[..len], dropped })

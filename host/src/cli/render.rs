@@ -1,9 +1,10 @@
 //! `occlude render`.
 
+use super::map::MapArgs;
 use super::{Ended, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
-use crate::integrator::{Exact, Stage, Visibility};
+use crate::integrator::{Exact, PreparedMap, Stage, Visibility};
 use crate::render::{Limits, render};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
 use crate::sampler::Pattern;
@@ -79,6 +80,9 @@ pub struct RenderArgs {
     quiet: bool,
 
     #[command(flatten)]
+    map: MapArgs,
+
+    #[command(flatten)]
     camera: CameraArgs,
 }
 
@@ -131,14 +135,8 @@ enum Method {
     /// Every shadow ray is traced through the scene.
     #[default]
     Exact,
-}
-
-impl Method {
-    fn visibility(self) -> Box<dyn Visibility> {
-        match self {
-            Self::Exact => Box::new(Exact),
-        }
-    }
+    /// Photons say what may be in the way, and only that is traced: quick or slow, and biased.
+    Map,
 }
 
 fn finite(text: &str) -> std::result::Result<f32, String> {
@@ -233,8 +231,19 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
 
     let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
     let limits = Limits { passes: args.spp, time: args.time_limit };
-    let method = args.method.visibility();
-    let rendered = render(&stage, &*method, size, limits, args.threads, &stop, |pass| progress.passed(pass))?;
+    args.map.check(args.method == Method::Map)?;
+    let start = Instant::now();
+    let prepared = match args.method {
+        Method::Map => Some(args.map.prepare(&stage, args.quality, args.threads)?),
+        Method::Exact => None,
+    };
+    let map = prepared.as_ref().map(PreparedMap::visibility);
+    let preprocess = start.elapsed();
+    let method: &dyn Visibility = match &map {
+        Some(map) => map,
+        None => &Exact,
+    };
+    let rendered = render(&stage, method, size, limits, args.threads, &stop, |pass| progress.passed(pass))?;
     progress.finish();
 
     let image = rendered.film.develop();
@@ -260,7 +269,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         time: Times {
             load_s: seconds(load),
             build_s: seconds(build),
-            preprocess_s: 0.0,
+            preprocess_s: seconds(preprocess),
             render_s: seconds(rendered.elapsed),
             camera_s: seconds(rendered.times.camera),
             light_s: seconds(rendered.times.light),
@@ -280,6 +289,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
             bvh_bytes_per_triangle: accel.bytes() as f64 / accel.triangles().max(1) as f64,
             triangles: accel.triangles(),
         },
+        map: prepared.as_ref().zip(map.as_ref()).map(|(prepared, map)| prepared.figures(map)),
         error,
     };
     if let Some(path) = &args.stats {

@@ -107,7 +107,7 @@ impl<'a> Nearest<'a> {
     /// As soon as k are known it pays to know how far the farthest of them is.
     #[inline(always)]
     pub(super) fn leaf_done(&mut self) {
-        if self.len >= self.k + self.k / 8 + 4 || (self.len >= self.k && self.reach == f32::INFINITY) {
+        if self.len >= self.k + self.k / 8 + 4 || (self.len >= self.k && self.reach == f32::MAX) {
             self.shrink();
         }
     }
