@@ -215,7 +215,8 @@ impl<'a, S: Simd> PhotonMap<'a, S> {
                     from = middle;
                 }
                 // Not the opposite comparison: what is NaN is looked at.
-                if !(square > nearest.reach()) {
+                let far = square > nearest.reach();
+                if !far {
                     stack[len & (DEPTH - 1)] =
                         Later { from: first as u32, to: last as u32, off: beyond, square };
                     len += 1;
