@@ -11,6 +11,7 @@ pub mod mesh;
 pub mod metrics;
 pub mod output;
 pub mod page;
+pub mod photons;
 pub mod render;
 pub mod report;
 pub mod reproduce;

@@ -31,6 +31,9 @@ pub struct Report {
     pub counts: WorkCounts,
     /// Memory.
     pub memory: Memory,
+    /// The occlusion map, if there was one.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub map: Option<MapFigures>,
     /// Against the reference, if one was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub error: Option<ErrorFigures>,
@@ -85,6 +88,41 @@ pub struct Memory {
     pub triangles: usize,
 }
 
+/// What an occlusion map holds and what it said.
+#[derive(Clone, Debug, Default, Serialize)]
+pub struct MapFigures {
+    /// Lines shot.
+    pub lines: u64,
+    /// Lines that met nothing.
+    pub lines_lost: u64,
+    /// Photons on the first surface of a line.
+    pub light_photons: usize,
+    /// Photons behind it.
+    pub occlusion_photons: usize,
+    /// Photons left out of lines with too many.
+    pub dropped_photons: u64,
+    /// Names of blockers left out of lines with too many.
+    pub dropped_blockers: u64,
+    /// What blockers are.
+    pub blockers: String,
+    /// Photons looked up.
+    pub k: usize,
+    /// Shooting, s on the clock.
+    pub shoot_s: f64,
+    /// Sorting, s on the clock.
+    pub sort_s: f64,
+    /// Bytes of the photons.
+    pub bytes: usize,
+    /// Points and lights said to be lit.
+    pub lit: u64,
+    /// Said to be dark.
+    pub dark: u64,
+    /// Said to be in a penumbra.
+    pub penumbra: u64,
+    /// With no photon near, and so traced through the scene.
+    pub unknown: u64,
+}
+
 /// How far the image is from a reference.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct ErrorFigures {
@@ -132,6 +170,24 @@ impl Report {
                 rays * 1e-6 / t.visibility_s.max(1e-9),
                 self.counts.triangle_tests as f64 / rays,
                 self.counts.node_tests as f64 / rays,
+            );
+        }
+        if let Some(map) = &self.map {
+            let all = (map.lit + map.dark + map.penumbra + map.unknown).max(1) as f64;
+            let part = |count: u64| 100.0 * count as f64 / all;
+            text += &format!(
+                "map: {} lines, {} light and {} occlusion photons, {:.1} MB, shot in {:.3} s, sorted in {:.3} s; \
+                 lit {:.1} %, dark {:.1} %, penumbra {:.1} %, no photon near {:.1} %\n",
+                map.lines,
+                map.light_photons,
+                map.occlusion_photons,
+                map.bytes as f64 * 1e-6,
+                map.shoot_s,
+                map.sort_s,
+                part(map.lit),
+                part(map.dark),
+                part(map.penumbra),
+                part(map.unknown),
             );
         }
         if let Some(error) = &self.error {

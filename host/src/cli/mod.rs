@@ -3,6 +3,8 @@
 pub mod compare;
 pub mod generate;
 pub mod info;
+pub mod map;
+pub mod photons;
 pub mod render;
 pub mod reproduce;
 
@@ -34,6 +36,8 @@ enum Command {
     Info(info::InfoArgs),
     /// Compare two images: error, bias, FLIP.
     Compare(compare::CompareArgs),
+    /// Show the photons of the occlusion map, and what they say.
+    Photons(photons::PhotonsArgs),
     /// Write a scene of any size.
     Generate(generate::GenerateArgs),
     /// Run the tables and figures of stochastic visibility again, and write a page of them.
@@ -68,6 +72,7 @@ pub fn run() -> ExitCode {
         Command::Render(args) => render::run(args, level),
         Command::Info(args) => info::run(args, level).map(|()| Ended::Done),
         Command::Compare(args) => compare::run(args).map(|()| Ended::Done),
+        Command::Photons(args) => photons::run(args, level).map(|()| Ended::Done),
         Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
         Command::Reproduce(args) => reproduce::run(args, level),
     };

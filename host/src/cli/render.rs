@@ -1,18 +1,20 @@
 //! `occlude render`.
 
+use super::map::{self, MapArgs};
 use super::{Ended, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
-use crate::integrator::{Exact, Form, Rule, Settings, Split, Stage, Stochastic, Visibility};
+use crate::integrator::{
+    Exact, Form, MapOptions, PreparedMap, Rule, Settings, Split, Stage, Stochastic, Visibility,
+};
 use crate::render::{Limits, render};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
 use crate::sampler::Pattern;
-use crate::scene::{CameraRequest, Scene};
+use crate::scene::CameraRequest;
 use crate::{light, metrics, output, scene};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use indicatif::{ProgressBar, ProgressStyle};
-use occlude_kernel::Bvh;
 use occlude_kernel::lanes::{Level, level_name};
 use std::io::IsTerminal;
 use std::path::PathBuf;
@@ -79,6 +81,9 @@ pub struct RenderArgs {
 
     #[command(flatten)]
     stochastic: StochasticArgs,
+
+    #[command(flatten)]
+    map: MapArgs,
 
     #[command(flatten)]
     camera: CameraArgs,
@@ -187,37 +192,41 @@ enum Method {
     Exact,
     /// A random part of the blockers is asked, by a sum over two groups of them: right on average, noisier.
     Stochastic,
+    /// Photons say what may be in the way, and only that is traced: quick or slow, and biased.
+    Map,
 }
 
 /// What `--method` and its options ask for.
 enum Chosen {
     Exact,
     Stochastic(Settings),
+    Map(MapOptions),
 }
 
 impl Chosen {
     fn from(args: &RenderArgs) -> Result<Self> {
-        match (args.method, args.stochastic.given()) {
-            (Method::Exact, None) => Ok(Self::Exact),
-            (Method::Exact, Some(option)) => {
-                Err(Error::Usage(format!("{option} is an option of --method stochastic")))
+        let foreign = [
+            (Method::Stochastic, args.stochastic.given(), "stochastic"),
+            (Method::Map, args.map.given(), "map"),
+        ];
+        for (method, given, name) in foreign {
+            if let (true, Some(option)) = (args.method != method, given) {
+                return Err(Error::Usage(format!("{option} is an option of --method {name}")));
             }
-            (Method::Stochastic, _) => args.stochastic.settings().map(Self::Stochastic),
         }
+        Ok(match args.method {
+            Method::Exact => Self::Exact,
+            Method::Stochastic => Self::Stochastic(args.stochastic.settings()?),
+            Method::Map => Self::Map(args.map.options(args.quality)),
+        })
     }
 
     fn name(&self) -> String {
         match self {
             Self::Exact => "exact".to_owned(),
             Self::Stochastic(settings) => format!("stochastic {settings}"),
+            Self::Map(_) => "map".to_owned(),
         }
-    }
-
-    fn visibility(&self, scene: &Scene, bvh: &Bvh<'_>) -> Result<Box<dyn Visibility>> {
-        Ok(match self {
-            Self::Exact => Box::new(Exact),
-            Self::Stochastic(settings) => Box::new(Stochastic::new(*settings, scene, bvh)?),
-        })
     }
 }
 
@@ -285,9 +294,6 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let start = Instant::now();
     let accel = Accel::build(&scene, args.quality);
     let build = start.elapsed();
-    let start = Instant::now();
-    let method = chosen.visibility(&scene, &accel.bvh())?;
-    let preprocess = start.elapsed();
     let lights = light::lights(&scene);
     let frame = camera.frame();
     let stage = Stage {
@@ -303,11 +309,26 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         count: args.stats.is_some(),
     };
 
+    let start = Instant::now();
+    let (mut stochastic, mut prepared) = (None, None);
+    match &chosen {
+        Chosen::Exact => {}
+        Chosen::Stochastic(settings) => stochastic = Some(Stochastic::new(*settings, &scene, &stage.bvh)?),
+        Chosen::Map(options) => prepared = Some(map::prepare(&stage, options, args.threads.into())?),
+    }
+    let map = prepared.as_ref().map(PreparedMap::visibility);
+    let method: &dyn Visibility = match (&stochastic, &map) {
+        (Some(stochastic), _) => stochastic,
+        (_, Some(map)) => map,
+        _ => &Exact,
+    };
+    let preprocess = start.elapsed();
+
     let stop = super::interruptible("the picture");
     let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
     let limits = Limits { passes: args.spp, time: args.time_limit };
     let rendered =
-        render(&stage, &*method, size, limits, args.threads.into(), &stop, |pass| progress.passed(pass))?;
+        render(&stage, method, size, limits, args.threads.into(), &stop, |pass| progress.passed(pass))?;
     progress.finish();
 
     let image = rendered.film.develop();
@@ -353,6 +374,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
             bvh_bytes_per_triangle: accel.bytes() as f64 / accel.triangles().max(1) as f64,
             triangles: accel.triangles(),
         },
+        map: prepared.as_ref().zip(map.as_ref()).map(|(prepared, map)| prepared.figures(map)),
         error,
     };
     if let Some(path) = &args.stats {

@@ -4,9 +4,11 @@
 //! differ, gets all its questions at once: [`Visibility`] is what a method implements.
 
 mod exact;
+mod map;
 mod stochastic;
 
 pub use exact::Exact;
+pub use map::{Classes, FLATNESS, Map, MapOptions, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
 use crate::film::{Tile, TileFilm};
@@ -86,6 +88,8 @@ pub struct Batch {
     pub light: u32,
     /// Its samples.
     pub samples: Range<u32>,
+    /// What part of the light the samples stand for: 1 on average, and 1 if it always gets samples.
+    pub share: f32,
 }
 
 /// What a tile asks: points, batches, and the samples of all batches one after the other.
@@ -313,7 +317,8 @@ fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
             }
             let last = weights.len() as u32;
             if last > first {
-                batches.push(Batch { point: index as u32, light, samples: first..last });
+                let share = count as f32 * each;
+                batches.push(Batch { point: index as u32, light, samples: first..last, share });
             }
         }
     }

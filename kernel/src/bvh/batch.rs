@@ -1,10 +1,11 @@
 //! One point and many points on a light: which of the segments are blocked?
 
 use super::packet::{Any, Rays, Start};
-use super::pyramid::{Forgetful, Learn, Learner, MOST, Pyramid, Stack};
-use super::{Bvh, Part};
+use super::pyramid::{Forgetful, Going, Learn, Learner, MOST, Pyramid, Stack};
+use super::{Bvh, CUT, Child, Part};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
+use crate::ray::Ray;
 use crate::vec3x;
 use glam::Vec3;
 
@@ -185,6 +186,84 @@ impl<S: Simd> Bvh<'_, S> {
         }
     }
 
+    /// The same, but only the triangles below these subtrees count: blockers that may be in the way, named by
+    /// whoever knows. Costs a traversal of each, until nothing is left to hide.
+    ///
+    /// Panics if one of them is beyond the tree's nodes or blocks.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    pub fn occluded_batch_by(
+        &self,
+        subtrees: &[Child],
+        x: impl Into<[f32; 3]>,
+        targets: &Targets<'_>,
+        part: impl Part,
+        counter: &mut impl Counter,
+        scratch: &mut BatchScratch,
+        blocked: &mut [u64],
+    ) {
+        let x = x.into();
+        let mut from = 0;
+        while from < targets.len() {
+            let count = (targets.len() - from).min(MOST);
+            let every = u64::MAX >> (64 - count);
+            counter.rays(count as u32);
+            let BatchScratch { pyramid, stack } = &mut *scratch;
+            let free =
+                if count >= FEW && pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
+                    self.pyramid_left_by(subtrees, pyramid, stack, part, counter)
+                } else {
+                    let mut free = every;
+                    let mut i = 0;
+                    while i < count {
+                        let ray = Ray::segment(x, targets.get(from + i));
+                        let mut next = 0;
+                        while next < subtrees.len() && free >> i & 1 == 1 {
+                            if self.occluded_below(subtrees[next], &ray, part, counter) {
+                                free &= !(1 << i);
+                            }
+                            next += 1;
+                        }
+                        i += 1;
+                    }
+                    free
+                };
+            blocked[from / MOST] = every & !free;
+            from += MOST;
+        }
+    }
+
+    /// Which of the pyramid's targets these subtrees leave free.
+    #[inline(always)]
+    fn pyramid_left_by(
+        &self,
+        subtrees: &[Child],
+        pyramid: &mut Pyramid,
+        stack: &mut Stack,
+        part: impl Part,
+        counter: &mut impl Counter,
+    ) -> u64 {
+        let every = pyramid.every();
+        let mut going = Going::new(every);
+        let mut from = 0;
+        while from < subtrees.len() && going.free != 0 {
+            let end = (from + AT_ONCE).min(subtrees.len());
+            stack.clear();
+            let mut next = end;
+            while next > from {
+                next -= 1;
+                if subtrees[next] != Child::NONE {
+                    stack.push((subtrees[next], 0.0, every));
+                }
+            }
+            going.starts_again();
+            self.pyramid_goes_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
+            self.packets_go_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
+            from = end;
+        }
+        going.free
+    }
+
     /// The same for up to 64 targets, in packets.
     #[inline(always)]
     pub(super) fn packets_from_root(
@@ -246,6 +325,9 @@ impl<S: Simd> Bvh<'_, S> {
         blocked
     }
 }
+
+/// Given subtrees that are on the stack together.
+const AT_ONCE: usize = CUT;
 
 /// Below this many targets a pyramid costs more than it saves.
 pub(super) const FEW: usize = 4;

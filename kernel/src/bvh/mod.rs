@@ -6,7 +6,7 @@
 //! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | | |
 //! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | | |
 //! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | | |
-//! | is any of these there? | [`Bvh::occluded_among`] | | [`Bvh::occluded_batch_among`] | |
+//! | is any of these there? | [`Bvh::occluded_among`] | | [`Bvh::occluded_batch_among`], [`Bvh::occluded_batch_by`] | |
 //!
 //! Which to use: for shadows, the tile wherever points come in neighbourhoods (about 8 by 8 pixels or texels at several
 //! samples a light, 16 by 16 at one); the batch for a point by itself with four samples or more; packets for other
@@ -226,6 +226,14 @@ impl<'a, S: Simd> Bvh<'a, S> {
     #[inline(always)]
     pub fn on<T: Simd>(&self, simd: T) -> Bvh<'a, T> {
         Bvh { nodes: self.nodes, blocks: self.blocks, magnitude: self.magnitude, simd }
+    }
+
+    /// Blocks of some of this tree's triangles, with no nodes above them, to ask by [`Bvh::occluded_batch_by`].
+    ///
+    /// Their vertices must be among those of the tree; others may be missed, or hit from too near.
+    #[inline(always)]
+    pub fn with_blocks<'b>(&self, blocks: &'b [TriangleBlock]) -> Bvh<'b, S> {
+        Bvh { nodes: &[], blocks, magnitude: self.magnitude, simd: self.simd }
     }
 
     /// The nodes.

@@ -975,6 +975,12 @@ impl Going {
     pub(super) fn new(free: u64) -> Self {
         Self { forms: Forms::NOTHING, free, visits: 0, sorted: false }
     }
+
+    /// As many nodes once more before packets take over.
+    #[inline(always)]
+    pub(super) fn starts_again(&mut self) {
+        self.visits = 0;
+    }
 }
 
 /// Hears of triangles that blocked something.

@@ -213,6 +213,26 @@ impl<S: Simd> Bvh<'_, S> {
         self.traverse_below(Child::node(0), ray, axis, part, counter, visitor);
     }
 
+    /// Does any triangle of the part in this subtree block the ray?
+    #[inline(always)]
+    pub(super) fn occluded_below(
+        &self,
+        subtree: Child,
+        ray: &Ray,
+        part: impl Part,
+        counter: &mut impl Counter,
+    ) -> bool {
+        let Some(axis) = dominant_axis(ray.origin, ray.direction) else {
+            return false;
+        };
+        if subtree == Child::NONE || ray.direction.abs().max_element() < SHORTEST {
+            return false;
+        }
+        let mut visitor = First { t_max: ray.t_max, found: None };
+        self.traverse_below(subtree, ray, axis, part, counter, &mut visitor);
+        visitor.found.is_some()
+    }
+
     /// Which triangle of the part in this subtree blocks a ray made ready, if any does?
     #[inline(always)]
     pub(super) fn blocker_of(

@@ -57,14 +57,18 @@ pub fn dispatch<T: Task>(level: Level, task: T) -> T::Output {
         if let Some(token) = level.as_avx512() {
             return vectorize(token, task, Dispatched16(token));
         }
+        #[cfg(not(occlude_one_level))]
         if let Some(token) = level.as_avx2() {
             return vectorize(token, task, Dispatched(token));
         }
-        if let Some(token) = level.as_sse4_2() {
-            return vectorize(token, task, Dispatched(token));
-        }
-        if let Some(token) = level.as_sse2() {
-            return vectorize(token, task, Dispatched(token));
+        #[cfg(not(occlude_one_level))]
+        {
+            if let Some(token) = level.as_sse4_2() {
+                return vectorize(token, task, Dispatched(token));
+            }
+            if let Some(token) = level.as_sse2() {
+                return vectorize(token, task, Dispatched(token));
+            }
         }
     }
     #[cfg(target_arch = "x86")]

@@ -1,0 +1,67 @@
+//! The options of the occlusion map, which several commands share.
+
+use crate::accel::Quality;
+use crate::error::{Error, Result};
+use crate::integrator::{MapOptions, PreparedMap, Stage};
+use crate::photons::BlockerKind;
+use clap::Args;
+
+/// The occlusion map's options.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Occlusion map (--method map)")]
+pub struct MapArgs {
+    /// Photons to shoot: lines from the lights [default: four a triangle, 250 000 to 4 000 000].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    photons: Option<u64>,
+
+    /// Photons to look up around a point [default: 50].
+    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    photon_k: Option<u32>,
+
+    /// How far to look for them [default: three times as far as they are on average].
+    #[arg(long, value_name = "R", value_parser = radius)]
+    photon_radius: Option<f32>,
+
+    /// What a photon names when something is in its way: triangle, object (of the file), or treelet:SIZE (a
+    /// subtree of the scene's tree with at most SIZE triangles) [default: treelet:128].
+    #[arg(long, value_name = "KIND")]
+    blockers: Option<BlockerKind>,
+}
+
+fn radius(text: &str) -> std::result::Result<f32, String> {
+    let value: f32 = text.parse().map_err(|_| "not a number".to_owned())?;
+    if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be finite and above 0".to_owned()) }
+}
+
+impl MapArgs {
+    /// The first option that was given.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.photons.is_some(), "--photons"),
+            (self.photon_k.is_some(), "--photon-k"),
+            (self.photon_radius.is_some(), "--photon-radius"),
+            (self.blockers.is_some(), "--blockers"),
+        ];
+        given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
+    }
+
+    /// What they ask for.
+    pub fn options(&self, quality: Quality) -> MapOptions {
+        MapOptions {
+            lines: self.photons,
+            k: self.photon_k.unwrap_or(50) as usize,
+            radius: self.photon_radius,
+            blockers: self.blockers.unwrap_or_default(),
+            quality,
+        }
+    }
+}
+
+/// Shoots the photons.
+pub fn prepare(stage: &Stage<'_>, options: &MapOptions, threads: usize) -> Result<PreparedMap> {
+    let pool = rayon::ThreadPoolBuilder::new()
+        .num_threads(threads)
+        .build()
+        .map_err(|error| Error::Usage(format!("cannot start {threads} threads: {error}")))?;
+    Ok(pool.install(|| PreparedMap::new(stage, options)))
+}

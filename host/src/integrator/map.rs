@@ -1,0 +1,333 @@
+//! The occlusion map: photons say what may be in the way, and shadow rays ask only that.
+//!
+//! Around a point the k nearest photons of a light tell three cases apart. Only light photons: lit, and the light is
+//! known in closed form. Only occlusion photons: dark. Both: penumbra, and shadow rays are traced against the blockers
+//! that the photons name, and nothing else. Where no photon is near, the scene is asked.
+//!
+//! Biased: what the photons miss casts no shadow, and thin shadows and slits of light can be lost. It is the thesis'
+//! method; the exact one is [`Exact`](super::Exact).
+
+use super::{Questions, Stage, Visibility};
+use crate::accel::Quality;
+use crate::photons::{BlockerKind, BlockerSet, PhotonStore, Shower, default_lines};
+use crate::report::MapFigures;
+use occlude_kernel::lanes::{Task, dispatch};
+use occlude_kernel::photons::{Class, Nearest, Neighbour, Photons, Place};
+use occlude_kernel::{
+    BatchScratch, Bvh, Child, Counter, Counts, Native, Simd, Targets, TriangleBlock, Uncounted,
+};
+use std::f32::consts::FRAC_1_PI;
+use std::sync::atomic::{AtomicU64, Ordering};
+
+/// How much more a step along the normal counts than one along the surface, when photons are looked up.
+pub const FLATNESS: f32 = 4.0;
+
+/// Room for the names of all photons of a look-up.
+const ROOM: usize = 8192;
+
+/// What to prepare.
+#[derive(Clone, Copy, Debug)]
+pub struct MapOptions {
+    /// Lines to shoot; from the size of the scene if not given.
+    pub lines: Option<u64>,
+    /// Photons to look up.
+    pub k: usize,
+    /// How far to look; from the density of the photons if not given.
+    pub radius: Option<f32>,
+    /// What photons name.
+    pub blockers: BlockerKind,
+    /// How long to look for good trees of objects.
+    pub quality: Quality,
+}
+
+/// The photons of a scene and its blockers.
+#[derive(Debug)]
+pub struct PreparedMap {
+    /// The photons.
+    pub store: PhotonStore,
+    /// What they name.
+    pub blockers: BlockerSet,
+    kind: BlockerKind,
+    k: usize,
+    radii: Vec<f32>,
+}
+
+impl PreparedMap {
+    /// Shoots the photons, on the threads of the current pool.
+    pub fn new(stage: &Stage<'_>, options: &MapOptions) -> Self {
+        let scene = stage.scene;
+        let blockers = BlockerSet::new(options.blockers, scene, &stage.bvh, options.quality);
+        let lines = options.lines.unwrap_or_else(|| default_lines(scene.triangles.len()));
+        let (bvh, lights, seed, level) = (stage.bvh, stage.lights, stage.seed, stage.level);
+        let store = Shower { bvh, lights, blockers: &blockers, lines, seed, level }.shoot();
+        let area = |triangle: u32| {
+            let [a, b, c] = scene.vertices(triangle).map(|v| v.as_dvec3());
+            0.5 * (b - a).cross(c - a).length()
+        };
+        let area: f64 = (0..scene.triangles.len() as u32).map(area).sum();
+        let radius = |light| options.radius.unwrap_or_else(|| store.radius(light, options.k, area));
+        let radii = (0..lights.len()).map(radius).collect();
+        Self { store, blockers, kind: options.blockers, k: options.k, radii }
+    }
+
+    /// The photons ready to be asked.
+    pub fn visibility(&self) -> Map<'_> {
+        let objects = match &self.blockers {
+            BlockerSet::Objects(_, trees) => trees.iter().map(|tree| tree.bvh()).collect(),
+            _ => Vec::new(),
+        };
+        Map { prepared: self, photons: self.store.by_light(), objects, classes: Default::default() }
+    }
+
+    /// Where to look for the photons of a light around a point of a surface.
+    #[inline]
+    pub fn place(&self, light: usize, x: glam::Vec3, normal: glam::Vec3) -> Place {
+        Place::disc(x, normal, self.radii[light], FLATNESS)
+    }
+
+    /// What it holds, and what it said so far.
+    pub fn figures(&self, map: &Map<'_>) -> MapFigures {
+        let (store, stats) = (&self.store, &self.store.stats);
+        let [lit, dark, penumbra, unknown] = map.classes().get();
+        MapFigures {
+            lines: stats.lines,
+            lines_lost: stats.lost,
+            light_photons: store.light().len(),
+            occlusion_photons: store.occlusion().len(),
+            dropped_photons: stats.dropped_photons,
+            dropped_blockers: stats.dropped_blockers,
+            blockers: self.kind.to_string(),
+            k: self.k,
+            shoot_s: stats.shot.as_secs_f64(),
+            sort_s: stats.sorted.as_secs_f64(),
+            bytes: store.bytes(),
+            lit,
+            dark,
+            penumbra,
+            unknown,
+        }
+    }
+
+    /// How many photons a look-up wants.
+    pub fn k(&self) -> usize {
+        self.k
+    }
+}
+
+/// Batches of each class so far.
+#[derive(Debug, Default)]
+pub struct Classes([AtomicU64; 4]);
+
+impl Classes {
+    /// Lit, dark, penumbra, and where no photon was near.
+    pub fn get(&self) -> [u64; 4] {
+        [0, 1, 2, 3].map(|class| self.0[class].load(Ordering::Relaxed))
+    }
+}
+
+/// Traces shadow rays against what photons name.
+#[derive(Debug)]
+pub struct Map<'a> {
+    prepared: &'a PreparedMap,
+    photons: Vec<Photons<'a, Native>>,
+    objects: Vec<Bvh<'a>>,
+    classes: Classes,
+}
+
+impl Map<'_> {
+    /// What the batches asked so far were.
+    pub fn classes(&self) -> &Classes {
+        &self.classes
+    }
+}
+
+impl Visibility for Map<'_> {
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        estimates.clear();
+        let classes = if stage.count {
+            dispatch(stage.level, Ask { map: self, stage, questions, estimates, counter: counts })
+        } else {
+            dispatch(stage.level, Ask { map: self, stage, questions, estimates, counter: &mut Uncounted })
+        };
+        for (total, of_tile) in self.classes.0.iter().zip(classes) {
+            total.fetch_add(of_tile, Ordering::Relaxed);
+        }
+    }
+}
+
+/// All batches of a tile.
+struct Ask<'a, C> {
+    map: &'a Map<'a>,
+    stage: &'a Stage<'a>,
+    questions: &'a Questions,
+    estimates: &'a mut Vec<f32>,
+    counter: &'a mut C,
+}
+
+impl<C: Counter> Task for Ask<'_, C> {
+    type Output = [u64; 4];
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> [u64; 4] {
+        let Self { map, stage, questions, estimates, counter } = self;
+        let prepared = map.prepared;
+        let bvh = stage.bvh.on(simd);
+        let mut slots = vec![Neighbour::NONE; Nearest::room(prepared.k)];
+        let mut nearest = Nearest::new(prepared.k, &mut slots).expect("room for k");
+        let mut room = vec![0; ROOM];
+        let mut tracer = Tracer { blocks: Vec::new(), roots: Vec::new(), scratch: BatchScratch::new() };
+        let mut blocked = [0u64; MOST / 64];
+        let mut classes = [0; 4];
+        let [x, y, z] = &questions.targets;
+        for batch in &questions.batches {
+            let point = &questions.points[batch.point as usize];
+            let light = &stage.lights[batch.light as usize];
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let place = prepared.place(batch.light as usize, point.x, point.normal);
+            let photons = map.photons[batch.light as usize].on(simd);
+            let class = photons.classify(&place, &mut nearest, &mut room);
+            let list = match class {
+                Class::Lit => {
+                    // Such that the samples add up to what is known.
+                    let sum: f32 = questions.weights[samples.clone()].iter().sum();
+                    let whole =
+                        light.unshadowed(point.x, point.normal).unwrap_or(0.0) * FRAC_1_PI * batch.share;
+                    let each = if sum > 0.0 { whole / sum } else { 0.0 };
+                    estimates.resize(estimates.len() + samples.len(), each);
+                    classes[0] += 1;
+                    continue;
+                }
+                Class::Dark => {
+                    estimates.resize(estimates.len() + samples.len(), 0.0);
+                    classes[1] += 1;
+                    continue;
+                }
+                Class::Penumbra(blockers) => {
+                    tracer.aim_at(&prepared.blockers, stage, blockers.list);
+                    classes[2] += 1;
+                    Some(blockers.list)
+                }
+                Class::Unknown => {
+                    classes[3] += 1;
+                    None
+                }
+            };
+            let mut from = samples.start;
+            while from < samples.end {
+                let part = from..samples.end.min(from + MOST);
+                from = part.end;
+                let count = part.len();
+                let Some(targets) = Targets::new(&x[part.clone()], &y[part.clone()], &z[part]) else {
+                    continue;
+                };
+                let targets = targets.on_parallelogram(light.corner, light.u, light.v);
+                let words = &mut blocked[..count.div_ceil(64)];
+                match list {
+                    None => {
+                        bvh.occluded_batch(point.origin, &targets, None, counter, &mut tracer.scratch, words)
+                    }
+                    Some(list) => {
+                        let blockers = (&prepared.blockers, &map.objects[..]);
+                        let x = point.origin.to_array();
+                        tracer.trace(blockers, (simd, bvh), list, x, &targets, counter, words);
+                    }
+                }
+                for i in 0..count {
+                    estimates.push(if blocked[i / 64] >> (i % 64) & 1 == 0 { 1.0 } else { 0.0 });
+                }
+            }
+        }
+        classes
+    }
+}
+
+/// Samples asked about at once.
+const MOST: usize = 256;
+
+/// Shadow rays against a list of blockers.
+struct Tracer {
+    blocks: Vec<TriangleBlock>,
+    roots: Vec<Child>,
+    scratch: BatchScratch,
+}
+
+impl Tracer {
+    /// Gathers what a list names: triangles by eights, or subtrees.
+    fn aim_at(&mut self, blockers: &BlockerSet, stage: &Stage<'_>, list: &[u32]) {
+        self.blocks.clear();
+        self.roots.clear();
+        match blockers {
+            BlockerSet::Triangles => {
+                for eight in list.chunks(TriangleBlock::WIDTH) {
+                    let mut block = TriangleBlock::EMPTY;
+                    for (lane, &triangle) in eight.iter().enumerate() {
+                        let corners = stage.scene.vertices(triangle).map(|corner| corner.to_array());
+                        block.set(lane, corners, triangle);
+                    }
+                    self.roots.push(Child::leaf(self.blocks.len() as u32));
+                    self.blocks.push(block);
+                }
+            }
+            BlockerSet::Objects(..) => {}
+            BlockerSet::Treelets(roots, _) => {
+                self.roots.extend(list.iter().map(|&treelet| roots[treelet as usize]));
+            }
+        }
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn trace<S: Simd>(
+        &mut self,
+        (blockers, objects): (&BlockerSet, &[Bvh<'_>]),
+        (simd, bvh): (S, Bvh<'_, S>),
+        list: &[u32],
+        x: [f32; 3],
+        targets: &Targets<'_>,
+        counter: &mut impl Counter,
+        blocked: &mut [u64],
+    ) {
+        let (roots, scratch) = (&self.roots, &mut self.scratch);
+        let (tree, roots) = match blockers {
+            BlockerSet::Triangles => (bvh.with_blocks(&self.blocks), &roots[..]),
+            BlockerSet::Treelets(..) => (bvh, &roots[..]),
+            BlockerSet::Objects(..) => {
+                // Trees of their own, each asked about what the others leave.
+                blocked.fill(0);
+                let mut by_one = [0u64; MOST / 64];
+                counter.rays(targets.len() as u32);
+                let mut tests = Tests(counter);
+                for &object in list {
+                    let tree = objects[object as usize].on(simd);
+                    tree.occluded_batch(x, targets, None, &mut tests, scratch, &mut by_one);
+                    for (word, more) in blocked.iter_mut().zip(by_one) {
+                        *word |= more;
+                    }
+                }
+                return;
+            }
+        };
+        tree.occluded_batch_by(roots, x, targets, None, counter, scratch, blocked);
+    }
+}
+
+/// Counts tests but not rays, where the same rays are asked more than once.
+struct Tests<'a, C>(&'a mut C);
+
+impl<C: Counter> Counter for Tests<'_, C> {
+    #[inline(always)]
+    fn triangle_tests(&mut self, pairs: u32) {
+        self.0.triangle_tests(pairs);
+    }
+
+    #[inline(always)]
+    fn node_tests(&mut self, pairs: u32) {
+        self.0.node_tests(pairs);
+    }
+}
