@@ -221,15 +221,22 @@ impl Shower<'_> {
     /// The ray of a line from a light: from a uniform point of it, in a cosine distributed direction of unit length.
     #[inline]
     pub fn ray(&self, line: u64, light: u32) -> Ray {
+        self.ray_and_place(line, light).0
+    }
+
+    /// The same, and where on the light's unit square it starts.
+    #[inline]
+    pub fn ray_and_place(&self, line: u64, light: u32) -> (Ray, [f32; 2]) {
         let light = &self.lights[light as usize];
         let mut sampler = Sampler::new(self.seed, line, STREAM);
-        let y = light.point([sampler.uniform(), sampler.uniform()]);
+        let place = [sampler.uniform(), sampler.uniform()];
+        let y = light.point(place);
         let (across, angle) = (sampler.uniform(), TAU * sampler.uniform());
         let radius = across.sqrt();
         let (u, v) = light.normal.any_orthonormal_pair();
         let direction =
             u * (radius * angle.cos()) + v * (radius * angle.sin()) + light.normal * (1.0 - across).sqrt();
-        Ray::from(offset(y, light.normal, self.bvh.clearance()), direction)
+        (Ray::from(offset(y, light.normal, self.bvh.clearance()), direction), place)
     }
 
     /// Shoots all lines and sorts what they leave, on the threads of the current pool.

@@ -1,6 +1,6 @@
 //! Every pixel, pass by pass.
 
-use crate::film::Film;
+use crate::film::{Film, TileFilm};
 use crate::integrator::{Scratch, Stage, StageTimes, Visibility, render_tile};
 use occlude_kernel::Counts;
 use rayon::prelude::*;
@@ -59,6 +59,8 @@ pub fn render(
     let mut passes = 0;
     let out_of_time = || limits.time.is_some_and(|most| start.elapsed() >= most);
     pool.install(|| {
+        let tiles: Vec<_> = film.tiles().iter().map(TileFilm::tile).collect();
+        method.begin(stage, &tiles, size.0);
         while passes < limits.passes && !stop.load(Ordering::Relaxed) && !(passes > 0 && out_of_time()) {
             film.tiles_mut().par_iter_mut().for_each(|tile| {
                 if stop.load(Ordering::Relaxed) {
@@ -73,6 +75,7 @@ pub fn render(
                 break;
             }
             passes += 1;
+            method.passed(stage);
             passed(passes);
         }
     });

@@ -17,20 +17,26 @@ impl Visibility for Exact {
         estimates: &mut Vec<f32>,
         counts: &mut Counts,
     ) {
-        let groups = groups(questions);
-        let mut blocked = vec![0; questions.weights.len().div_ceil(64)];
-        let (bvh, lights) = (stage.bvh, stage.lights);
-        let (groups, words) = (groups.as_slice(), blocked.as_mut_slice());
-        if stage.count {
-            dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter: counts });
-        } else {
-            let counter = &mut Uncounted;
-            dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter });
-        }
+        let blocked = blocked(stage, questions, counts);
         estimates.clear();
         let free = |i: usize| blocked[i / 64] >> (i % 64) & 1 == 0;
         estimates.extend((0..questions.weights.len()).map(|i| if free(i) { 1.0 } else { 0.0 }));
     }
+}
+
+/// Which samples are blocked, a bit each.
+pub(super) fn blocked(stage: &Stage<'_>, questions: &Questions, counts: &mut Counts) -> Vec<u64> {
+    let groups = groups(questions);
+    let mut blocked = vec![0; questions.weights.len().div_ceil(64)];
+    let (bvh, lights) = (stage.bvh, stage.lights);
+    let (groups, words) = (groups.as_slice(), blocked.as_mut_slice());
+    if stage.count {
+        dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter: counts });
+    } else {
+        let counter = &mut Uncounted;
+        dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter });
+    }
+    blocked
 }
 
 /// Points that share a shaft: one light, and places near each other.

@@ -3,10 +3,12 @@
 //! The stages stand apart so that each can be timed, and so that visibility, the only one in which methods
 //! differ, gets all its questions at once: [`Visibility`] is what a method implements.
 
+mod auto;
 mod exact;
 mod map;
 mod stochastic;
 
+pub use auto::{Auto, AutoOptions};
 pub use exact::Exact;
 pub use map::{Classes, FLATNESS, Map, MapOptions, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
@@ -17,6 +19,7 @@ use crate::sampler::{Pattern, Sampler};
 use crate::scene::{Frame, Scene};
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
+use occlude_kernel::occlusion_map::{Odds, bin};
 use occlude_kernel::{Bvh, Counter, Counts, RayPacket, Simd, Uncounted, offset};
 use std::f32::consts::FRAC_1_PI;
 use std::ops::Range;
@@ -48,7 +51,21 @@ pub struct Stage<'a> {
 }
 
 /// Answers, for a tile, how much of each light sample arrives.
+///
+/// Of a pass, tiles are asked in any order and at the same time, and none of them learns from another: what a method
+/// learns it may use from the next pass on, in [`Visibility::passed`].
 pub trait Visibility: Sync {
+    /// Gets ready, before the first pass, for an image in these tiles.
+    fn begin(&self, _: &Stage<'_>, _: &[Tile], _width: u32) {}
+
+    /// Says which samples of the lights the points of `scratch` ask about, and adds what needs no asking.
+    fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
+        sample_lights(stage, scratch);
+    }
+
+    /// Hears that a pass has ended.
+    fn passed(&self, _: &Stage<'_>) {}
+
     /// Writes an estimate for each sample of `questions`, in their order: right on average, and for an exact
     /// method 0 or 1.
     fn estimate(
@@ -105,6 +122,9 @@ pub struct Questions {
     pub weights: Vec<f32>,
     /// Pixels across the tile.
     pub width: u32,
+    /// Of methods that learn: what they think of each sample, and where they keep what becomes of it.
+    odds: Vec<Odds>,
+    places: Vec<u32>,
 }
 
 impl Questions {
@@ -113,6 +133,8 @@ impl Questions {
         self.batches.clear();
         self.targets.iter_mut().for_each(Vec::clear);
         self.weights.clear();
+        self.odds.clear();
+        self.places.clear();
     }
 }
 
@@ -145,8 +167,9 @@ pub struct Scratch {
     radiance: Vec<Vec3>,
     questions: Questions,
     estimates: Vec<f32>,
-    shares: Vec<(u32, f32)>,
+    shares: Vec<Share>,
     square: Vec<[f32; 2]>,
+    fan: Fan,
     /// Time spent so far.
     pub times: StageTimes,
     /// Work done so far: camera rays apart, since they are no shadow rays.
@@ -173,7 +196,7 @@ pub fn render_tile(
     scratch.radiance.resize(tile.len(), Vec3::ZERO);
     cast(stage, tile, width, pass, scratch);
     let cast_end = Instant::now();
-    sample_lights(stage, scratch);
+    method.ask(stage, scratch);
     let light_end = Instant::now();
     method.estimate(stage, &scratch.questions, &mut scratch.estimates, &mut scratch.shadow_counts);
     let visibility_end = Instant::now();
@@ -263,62 +286,162 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scra
 /// The part of the shadow rays that every light in sight shares evenly, whatever its estimate says.
 const FAIR_SHARE: f32 = 0.1;
 
-/// Spreads the shadow rays of each point over the lights and over their areas.
+/// The lights that a point may see, and how many samples each gets: the number, what each counts, and what part of
+/// the light they stand for together.
 ///
 /// A light gets rays in proportion to the irradiance it would give with nothing in the way, in closed form, and
 /// a tenth of them is shared evenly. Rounding to whole rays is systematic sampling with one random number: a
 /// light due `e` rays gets `floor(e)` or `ceil(e)`, and `e` on average. Where that is never 0 its samples are
 /// averaged (weight 1/n), which is right for either number; else they are weighed by 1/e.
-fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
-    let Scratch { samplers, questions, shares, square, .. } = scratch;
-    let clearance = stage.bvh.clearance();
-    let Questions { points, batches, targets, weights, .. } = questions;
-    for (index, point) in points.iter().enumerate() {
-        let sampler = &mut samplers[point.pixel as usize];
-        shares.clear();
-        shares.extend(stage.lights.iter().enumerate().filter_map(|(light, area)| {
-            Some((light as u32, area.unshadowed(point.x, point.normal)? * area.radiance.element_sum()))
-        }));
-        let total: f32 = shares.iter().map(|share| share.1).sum();
-        let fair = FAIR_SHARE / shares.len() as f32;
-        let mut due = f64::from(sampler.uniform());
-        let mut given = 0u32;
-        for (place, &(light, share)) in shares.iter().enumerate() {
-            let expected = stage.shadow_rays as f32 * ((1.0 - FAIR_SHARE) * share / total + fair);
-            due += f64::from(expected);
-            // All of the rays are given in the end, whatever rounding does.
-            let until = if place + 1 == shares.len() { stage.shadow_rays } else { due as u32 };
-            let until = until.clamp(given, stage.shadow_rays);
-            let count = until - given;
-            given = until;
-            if count == 0 {
-                continue;
+fn divide(stage: &Stage<'_>, point: &ShadingPoint, sampler: &mut Sampler, shares: &mut Vec<Share>) {
+    shares.clear();
+    shares.extend(stage.lights.iter().enumerate().filter_map(|(light, area)| {
+        let unshadowed = area.unshadowed(point.x, point.normal)?;
+        Some(Share { light: light as u32, unshadowed, count: 0, each: 0.0 })
+    }));
+    let value = |share: &Share| share.unshadowed * stage.lights[share.light as usize].radiance.element_sum();
+    let total: f32 = shares.iter().map(value).sum();
+    let fair = FAIR_SHARE / shares.len() as f32;
+    let mut due = f64::from(sampler.uniform());
+    let mut given = 0u32;
+    let last = shares.len().saturating_sub(1);
+    for (place, share) in shares.iter_mut().enumerate() {
+        let expected = stage.shadow_rays as f32 * ((1.0 - FAIR_SHARE) * value(share) / total + fair);
+        due += f64::from(expected);
+        // All of the rays are given in the end, whatever rounding does.
+        let until = if place == last { stage.shadow_rays } else { due as u32 };
+        let until = until.clamp(given, stage.shadow_rays);
+        share.count = until - given;
+        given = until;
+        share.each = if expected > 1.001 { 1.0 / share.count as f32 } else { 1.0 / expected };
+    }
+}
+
+/// The samples of a light that a point gets.
+#[derive(Clone, Copy, Debug)]
+struct Share {
+    light: u32,
+    /// Irradiance with nothing in the way, of radiance 1.
+    unshadowed: f32,
+    count: u32,
+    each: f32,
+}
+
+/// Points of one light as seen from one point: places, and what each adds.
+#[derive(Clone, Debug, Default)]
+struct Fan {
+    /// Moved off the light: x, y and z.
+    targets: [Vec<f32>; 3],
+    /// 0 for one that sends nothing there.
+    weights: Vec<f32>,
+    /// Which part of the light they lie in.
+    bins: Vec<u8>,
+}
+
+impl Fan {
+    /// Opens it to points of the light's unit square.
+    fn open(
+        &mut self,
+        stage: &Stage<'_>,
+        area: &AreaLight,
+        point: &ShadingPoint,
+        square: &[[f32; 2]],
+        each: f32,
+    ) {
+        self.targets.iter_mut().for_each(|axis| axis.resize(square.len(), 0.0));
+        self.weights.resize(square.len(), 0.0);
+        self.bins.resize(square.len(), 0);
+        let clearance = stage.bvh.clearance();
+        dispatch(stage.level, Open { fan: self, area, point, square, each, clearance });
+    }
+
+    /// Some of the samples.
+    fn append_some_to(&self, some: &[u32], questions: &mut Questions) {
+        for (to, from) in questions.targets.iter_mut().zip(&self.targets) {
+            to.extend(some.iter().map(|&i| from[i as usize]));
+        }
+        questions.weights.extend(some.iter().map(|&i| self.weights[i as usize]));
+    }
+
+    /// The samples that send something.
+    fn append_to(&self, questions: &mut Questions) {
+        let all = self.weights.iter().all(|&weight| weight > 0.0);
+        for (to, from) in questions.targets.iter_mut().zip(&self.targets) {
+            if all {
+                to.extend_from_slice(from);
+            } else {
+                to.extend(from.iter().zip(&self.weights).filter(|(_, w)| **w > 0.0).map(|(at, _)| at));
             }
-            let area = &stage.lights[light as usize];
-            let each = if expected > 1.001 { 1.0 / count as f32 } else { 1.0 / expected };
-            let first = weights.len() as u32;
+        }
+        questions.weights.extend(self.weights.iter().filter(|weight| **weight > 0.0));
+    }
+}
+
+/// Loops over plain slices, for the compiler to turn into vectors of the level.
+struct Open<'a> {
+    fan: &'a mut Fan,
+    area: &'a AreaLight,
+    point: &'a ShadingPoint,
+    square: &'a [[f32; 2]],
+    each: f32,
+    clearance: f32,
+}
+
+impl Task for Open<'_> {
+    type Output = ();
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _: S) {
+        let Self { fan, area, point, square, each, clearance } = self;
+        let count = square.len();
+        let [x, y, z] = &mut fan.targets;
+        let (x, y, z) = (&mut x[..count], &mut y[..count], &mut z[..count]);
+        let weights = &mut fan.weights[..count];
+        let bins = &mut fan.bins[..count];
+        // Cosines, inverse square, the density of a point, and the reflection of a diffuse surface.
+        let scale = area.area * FRAC_1_PI * each;
+        let whole = area.shape == crate::light::Shape::Parallelogram;
+        let mut i = 0;
+        while i < count {
+            let [mut s, mut t] = square[i];
+            bins[i] = bin(square[i]) as u8;
+            if !whole {
+                let root = s.sqrt();
+                (s, t) = (1.0 - root, t * root);
+            }
+            let at = area.corner + area.u * s + area.v * t;
+            let path = at - point.x;
+            let squared = path.length_squared();
+            let (leaving, arriving) = (-area.normal.dot(path), point.normal.dot(path));
+            let arrives = leaving > 0.0 && arriving > 0.0;
+            let weight = leaving / squared * (arriving / squared) * scale;
+            weights[i] = if arrives { weight } else { 0.0 };
+            let target = at + area.normal * clearance;
+            x[i] = target.x;
+            y[i] = target.y;
+            z[i] = target.z;
+            i += 1;
+        }
+    }
+}
+
+/// Spreads the shadow rays of each point over the lights and over their areas.
+fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
+    let Scratch { samplers, questions, shares, square, fan, .. } = scratch;
+    for index in 0..questions.points.len() {
+        let point = questions.points[index];
+        let sampler = &mut samplers[point.pixel as usize];
+        divide(stage, &point, sampler, shares);
+        for &Share { light, count, each, .. } in shares.iter().filter(|share| share.count > 0) {
+            let first = questions.weights.len() as u32;
             square.clear();
             sampler.points(stage.pattern, count as usize, square);
-            for &at in square.iter() {
-                let y = area.point(at);
-                let path = y - point.x;
-                let squared = path.length_squared();
-                let (leaving, arriving) = (-area.normal.dot(path), point.normal.dot(path));
-                if leaving <= 0.0 || arriving <= 0.0 {
-                    continue;
-                }
-                let target = offset(y, area.normal, clearance);
-                for axis in 0..3 {
-                    targets[axis].push(target[axis]);
-                }
-                // Cosines, inverse square, the density of a point, and the reflection of a diffuse surface.
-                let geometry = leaving / squared * (arriving / squared);
-                weights.push(geometry * area.area * FRAC_1_PI * each);
-            }
-            let last = weights.len() as u32;
+            fan.open(stage, &stage.lights[light as usize], &point, square, each);
+            fan.append_to(questions);
+            let last = questions.weights.len() as u32;
             if last > first {
                 let share = count as f32 * each;
-                batches.push(Batch { point: index as u32, light, samples: first..last, share });
+                questions.batches.push(Batch { point: index as u32, light, samples: first..last, share });
             }
         }
     }
