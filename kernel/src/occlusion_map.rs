@@ -4,9 +4,9 @@
 //! three things:
 //!
 //! - *lit*: a shaft around all of the cell's points and the light met nothing. Exact: no ray is needed;
-//! - *odds*: the light is cut into bins, and each has u, the part of the segments that were free so far, and q, the
-//!   chance that one is worth a ray;
-//! - nothing: every segment is asked.
+//! - *odds*: the light is cut into bins, and each has u, the part of the segments that were free so far, and a class of
+//!   doubt, which says with what chance q one is worth a ray;
+//! - nothing, or nothing that helps: every segment is asked.
 //!
 //! With odds the estimate of a segment's visibility V is
 //!
@@ -18,6 +18,9 @@
 //! above 0, as long as they do not depend on the segment at hand; its variance is `(1/q - 1) E[(V - u)²]`. Where a bin
 //! is all dark or all free, as most are away from the borders of shadows, that is next to nothing even for a small q:
 //! so the rays go where shadows begin and end, on the surfaces and on the light.
+//!
+//! How far the doubts are right is itself measured: [`Doubts`] sums `(V - u)²` for each class, and [`Doubts::chances`]
+//! turns that into the q of each class.
 //!
 //! Nothing here is written while it is read, and no number is drawn: the caller collects what rays saw in [`Tally`]s,
 //! and makes new odds of them ([`MapCell::learn`]) between passes.
@@ -122,23 +125,26 @@ pub struct MapCell {
     upper: [f32; 3],
     state: u32,
     spare: [u8; 4],
-    /// What all bins share, if they do: u in units of 1/255, and q in units of 1/16.
+    /// What all bins share, if they do: u in units of 1/255, and the class; and whether they do.
     flat: [u8; 4],
     /// u, in units of 1/255.
     u: [u8; BINS],
-    /// q, in units of 1/16: 1 to 16.
-    q: [u8; BINS],
+    /// Classes of doubt.
+    class: [u8; BINS],
 }
 
 const NOTHING: u32 = 0;
 const ODDS: u32 = 1;
 const LIT: u32 = 2;
+const ALL: u32 = 3;
 
 /// What a cell says of the segments to its light.
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub enum Known {
     /// Nothing: ask.
     Nothing,
+    /// That most segments are worth a ray: asking all costs no more. No need to tell what they saw.
+    All,
     /// All of them are free.
     Lit,
     /// The same for all bins.
@@ -160,7 +166,7 @@ impl MapCell {
             spare: [0; 4],
             flat: [0; 4],
             u: [0; BINS],
-            q: [LEAST_CHANCE as u8; BINS],
+            class: [0; BINS],
         }
     }
 
@@ -239,17 +245,18 @@ impl MapCell {
     pub fn known(&self, x: impl Into<[f32; 3]>) -> Known {
         match self.state {
             LIT if self.covers(x) => Known::Lit,
-            LIT => Known::Flat(Odds { u: 255, q: 1 }),
-            ODDS if self.flat[2] == 1 => Known::Flat(Odds { u: self.flat[0], q: self.flat[1] }),
+            LIT => Known::Flat(Odds { u: 255, class: CLASSES as u8 - 1 }),
+            ODDS if self.flat[2] == 1 => Known::Flat(Odds { u: self.flat[0], class: self.flat[1] }),
+            ALL => Known::All,
             ODDS => Known::Bins,
             _ => Known::Nothing,
         }
     }
 
-    /// u and q of a bin. Panics if there is no such bin.
+    /// What is thought of a bin. Panics if there is no such bin.
     #[inline(always)]
     pub fn odds(&self, bin: usize) -> Odds {
-        Odds { u: self.u[bin], q: self.q[bin] }
+        Odds { u: self.u[bin], class: self.class[bin] }
     }
 
     /// The part of each bin's segments that one expects to be free, by everything that rays have seen so far; `None` if
@@ -293,31 +300,136 @@ impl MapCell {
         Some(expected)
     }
 
-    /// Makes odds of what one expects: u is that, and `q = eagerness · sqrt(u (1 - u))`, at least 1 in
-    /// [`LEAST_CHANCE`] and at most 1. Nothing to expect, and a cell knows nothing. What is lit stays so.
-    pub fn learn(&mut self, expected: Option<&[f32; BINS]>, eagerness: f32) {
+    /// Makes odds of what one expects: u is that, and the class of doubt follows from the variance u (1 - u). Nothing
+    /// to expect, and a cell knows nothing. What is lit stays so.
+    ///
+    /// Where more than this part of the rays would be asked, all are from then on.
+    pub fn learn(&mut self, expected: Option<&[f32; BINS]>, chances: &Chances, most: f32) {
         let Some(expected) = expected.filter(|_| self.state != LIT) else {
             self.state = if self.state == LIT { LIT } else { NOTHING };
             return;
         };
+        let mut sum = 0;
         for (bin, &p) in expected.iter().enumerate() {
-            let q = LEAST_CHANCE as f32 * chance(p * (1.0 - p), eagerness);
             self.u[bin] = (p * 255.0 + 0.5) as u8;
-            self.q[bin] = (libm::ceilf(q) as u32).clamp(1, LEAST_CHANCE) as u8;
+            self.class[bin] = class(p) as u8;
+            sum += u32::from(chances.of(self.class[bin]));
         }
-        let alike = self.u.iter().all(|&u| u == self.u[0]) && self.q.iter().all(|&q| q == self.q[0]);
-        self.flat = [self.u[0], self.q[0], u8::from(alike), 0];
-        self.state = ODDS;
+        let alike =
+            self.u.iter().all(|&u| u == self.u[0]) && self.class.iter().all(|&class| class == self.class[0]);
+        self.flat = [self.u[0], self.class[0], u8::from(alike), 0];
+        let asked = sum as f32 / (LEAST_CHANCE as usize * BINS) as f32;
+        self.state = if asked > most { ALL } else { ODDS };
     }
 }
 
-/// The chance that a segment gets a ray, if its visibility has this variance.
-///
-/// With rays given so, the product of all work and all error is least where the eagerness is the root of (work) /
-/// (variance), both summed over the picture and with work counted in rays.
+/// Classes of doubt: each stands for half the variance of the one before it.
+pub const CLASSES: usize = 16;
+
+/// The class of a bin that is expected to be free with this chance.
 #[inline]
-pub fn chance(variance: f32, eagerness: f32) -> f32 {
-    (eagerness * libm::sqrtf(variance.max(0.0))).clamp(1.0 / LEAST_CHANCE as f32, 1.0)
+pub fn class(p: f32) -> usize {
+    let variance = (4.0 * p * (1.0 - p)).max(f32::MIN_POSITIVE);
+    // Minus the logarithm to base 2, rounded down.
+    let power = 126 - (variance.to_bits() >> 23) as i32;
+    power.clamp(0, CLASSES as i32 - 1) as usize
+}
+
+/// What is thought of `(V - u)²` before there are rays to tell: enough to ask them.
+const UNSURE: f64 = 0.01;
+
+/// How far guesses were off, by class.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub struct Doubts {
+    /// Rays.
+    pub asked: [u64; CLASSES],
+    /// Sum of `(V - u)²` in units of 255⁻².
+    pub squared: [u64; CLASSES],
+}
+
+impl Doubts {
+    /// Counts a ray.
+    #[inline(always)]
+    pub fn count(&mut self, odds: Odds, free: bool) {
+        let off = i32::from(odds.u) - if free { 255 } else { 0 };
+        let class = odds.class as usize & (CLASSES - 1);
+        self.asked[class] += 1;
+        self.squared[class] += (off * off) as u64;
+    }
+
+    /// Adds what another has counted.
+    pub fn merge(&mut self, other: &Self) {
+        for class in 0..CLASSES {
+            self.asked[class] += other.asked[class];
+            self.squared[class] += other.squared[class];
+        }
+    }
+
+    /// Halves what is known, so that later guesses count for more.
+    pub fn fade(&mut self) {
+        for class in 0..CLASSES {
+            self.asked[class] /= 2;
+            self.squared[class] /= 2;
+        }
+    }
+
+    /// E[(V - u)²] of a class: as measured, or 0.01 where there are few rays.
+    pub fn variance(&self, class: usize) -> f64 {
+        let few = 64.0;
+        let measured = self.squared[class] as f64 / (255.0 * 255.0);
+        (measured + few * UNSURE) / (self.asked[class] as f64 + few)
+    }
+
+    /// The chances that make the product of work and error least, where `segments` of each class are to come,
+    /// `unknown` ones are asked for sure, and a segment costs `overhead` rays before it is asked. `spread` is what the
+    /// samples' pattern leaves of the variance that bins have by themselves.
+    pub fn chances(&self, segments: &[u64; CLASSES], unknown: u64, overhead: f64, spread: f64) -> Chances {
+        let mut variance = [0.0; CLASSES];
+        let mut base = 0.0;
+        for class in 0..CLASSES {
+            variance[class] = self.variance(class);
+            base += spread * segments[class] as f64 * variance[class];
+        }
+        let mut best = (f64::INFINITY, Chances::ALL);
+        // q = eagerness · sqrt(variance) for eagernesses from 1/4 to 2^13.5, by half powers of 2.
+        let mut eagerness = 0.25;
+        for _ in 0..32 {
+            let (mut work, mut error) = (unknown as f64, base);
+            let mut chances = Chances::ALL;
+            for class in 0..CLASSES {
+                let sixteenths = libm::ceil(16.0 * eagerness * libm::sqrt(variance[class]));
+                chances.0[class] = sixteenths.clamp(1.0, 16.0) as u8;
+                let q = f64::from(chances.0[class]) / 16.0;
+                work += segments[class] as f64 * (q + overhead);
+                error += segments[class] as f64 * variance[class] * (1.0 / q - 1.0);
+            }
+            if work * error < best.0 {
+                best = (work * error, chances);
+            }
+            eagerness *= core::f64::consts::SQRT_2;
+        }
+        best.1
+    }
+}
+
+/// The chance to be asked of each class of doubt, in units of 1/16.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Chances([u8; CLASSES]);
+
+impl Chances {
+    /// Ask everything.
+    pub const ALL: Self = Self([LEAST_CHANCE as u8; CLASSES]);
+
+    /// The same for all classes: `sixteenths` from 1 to 16, or the nearest of these.
+    pub fn each(sixteenths: u8) -> Self {
+        Self([sixteenths.clamp(1, LEAST_CHANCE as u8); CLASSES])
+    }
+
+    /// In units of 1/16: from 1 to 16.
+    #[inline(always)]
+    pub fn of(&self, class: u8) -> u8 {
+        self.0[class as usize & (CLASSES - 1)]
+    }
 }
 
 /// Rays before a cell has odds.
@@ -353,36 +465,27 @@ impl Coin {
     }
 }
 
-/// u and q of a bin, as the map stores them.
+/// What is thought of a segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub struct Odds {
     /// u, in units of 1/255.
     pub u: u8,
-    /// q, in units of 1/16.
-    pub q: u8,
+    /// The class of doubt.
+    pub class: u8,
 }
 
 impl Odds {
-    /// Always ask.
-    pub const NONE: Self = Self { u: 0, q: LEAST_CHANCE as u8 };
-
     /// What is thought of a segment that is not asked.
     #[inline(always)]
     pub fn guess(self) -> f32 {
         unit(self.u)
     }
 
-    /// The chance to be asked.
-    #[inline(always)]
-    pub fn chance(self) -> f32 {
-        f32::from(self.q) * (1.0 / LEAST_CHANCE as f32)
-    }
-
     /// What a ray adds to the guess: `(V - u)/q`.
     #[inline(always)]
-    pub fn correction(self, free: bool) -> f32 {
+    pub fn correction(self, chances: &Chances, free: bool) -> f32 {
         let visible = if free { 1.0 } else { 0.0 };
-        (visible - self.guess()) / self.chance()
+        (visible - self.guess()) * (LEAST_CHANCE as f32 / f32::from(chances.of(self.class)))
     }
 }
 

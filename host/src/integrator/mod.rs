@@ -123,7 +123,7 @@ pub struct Questions {
     /// Pixels across the tile.
     pub width: u32,
     /// Of methods that learn: what they think of each sample, and where they keep what becomes of it.
-    odds: Vec<Odds>,
+    odds: Vec<Option<Odds>>,
     places: Vec<u32>,
 }
 
