@@ -7,7 +7,7 @@ mod exact;
 mod map;
 mod stochastic;
 
-pub use exact::Exact;
+pub use exact::{Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 

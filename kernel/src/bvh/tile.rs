@@ -9,7 +9,7 @@ use super::batch::{BatchScratch, FEW};
 use super::packet::{Any, Nobody, Rays, Start};
 use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft};
-use super::{Bvh, CUT, Child, Node, Targets};
+use super::{Bvh, CUT, Child, Node, Occluders, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::triangle::{NO_TRIANGLE, TriangleBlock};
@@ -251,6 +251,26 @@ impl<S: Simd> Bvh<'_, S> {
         scratch: &mut TileScratch,
         blocked: &mut [u64],
     ) {
+        self.occluded_tile_with(&Occluders::NONE, points, targets, ignore, counter, scratch, blocked);
+    }
+
+    /// The same answers, quicker where one of these boxes stands between all of the points and all of the targets:
+    /// then no ray is traced.
+    ///
+    /// The targets must be outside the meshes that the boxes are inside of (see [`Occluders`]). With a triangle to
+    /// ignore the boxes are not asked, as it may be of such a mesh.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    pub fn occluded_tile_with(
+        &self,
+        occluders: &Occluders<'_>,
+        points: &[TilePoint],
+        targets: &Targets<'_>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        scratch: &mut TileScratch,
+        blocked: &mut [u64],
+    ) {
         let mut rays = 0;
         let mut k = 0;
         while k < points.len() {
@@ -263,6 +283,17 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         let shaft = if rays < WORTHWHILE { None } else { self.shaft(points, targets) };
+        if let (Some(shaft), false, None) = (&shaft, occluders.is_empty(), ignore)
+            && self.walled_off(occluders, shaft, counter)
+        {
+            counter.rays(rays as u32);
+            let mut k = 0;
+            while k < points.len() {
+                let (first, end) = run(points, &mut k);
+                fill(blocked, first, end - first);
+            }
+            return;
+        }
         let TileScratch { batch, cut, given, learned, packet } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
@@ -625,6 +656,18 @@ fn clear(blocked: &mut [u64], first: usize, count: usize) {
     while i < end {
         let (bit, part) = (i % 64, (end - i).min(64 - i % 64));
         blocked[i / 64] &= !((u64::MAX >> (64 - part)) << bit);
+        i += part;
+    }
+}
+
+/// Sets the bits of `count` targets from the `first`th on.
+#[inline(always)]
+fn fill(blocked: &mut [u64], first: usize, count: usize) {
+    let mut i = first;
+    let end = first + count;
+    while i < end {
+        let (bit, part) = (i % 64, (end - i).min(64 - i % 64));
+        blocked[i / 64] |= (u64::MAX >> (64 - part)) << bit;
         i += part;
     }
 }
