@@ -89,7 +89,7 @@ const ALL_VOXELS: usize = 1 << 26;
 
 /// Where boxes fill less than this part of a mesh, voxels half as large are tried, while they are no more than `FINER`
 /// and the mesh's share of all.
-const ENOUGH: f64 = 0.7;
+const ENOUGH: f64 = 0.3;
 const FINER: usize = 1 << 21;
 
 /// Pairs of triangles and voxels looked at for one mesh.

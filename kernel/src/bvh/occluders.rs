@@ -188,6 +188,66 @@ impl Pairs {
     }
 }
 
+/// A few boxes that a tile's points ask before any triangle.
+pub(super) struct Walls {
+    boxes: [[Vec3; 2]; Walls::MOST],
+    count: usize,
+    /// What they hid so far, and what they should have.
+    worth: i32,
+}
+
+impl Walls {
+    const MOST: usize = 4;
+
+    pub(super) const NONE: Self = Self { boxes: [[Vec3::ZERO; 2]; Self::MOST], count: 0, worth: 0 };
+
+    #[inline(always)]
+    fn add(&mut self, wall: [Vec3; 2]) {
+        if self.count < Self::MOST {
+            self.boxes[self.count] = wall;
+            self.count += 1;
+        }
+    }
+
+    #[inline(always)]
+    pub(super) fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// Which of the pyramid's targets they hide. They are given up where that is too few of them.
+    #[inline(always)]
+    pub(super) fn hide<S: Simd>(&mut self, simd: S, pyramid: &Pyramid, counter: &mut impl Counter) -> u64 {
+        type P<S> = <S as Simd>::Packet;
+        let token = simd.token();
+        let origin = vec3x::splat::<P<S>>(token, pyramid.x.to_array());
+        let mut hidden = 0;
+        let mut i = 0;
+        while i < pyramid.count {
+            let (inverse, sound) = invert::<P<S>>(token, vec3x::load(token, &pyramid.direction, i));
+            let mut bits = 0;
+            let mut k = 0;
+            while k < self.count {
+                let lower = vec3x::splat::<P<S>>(token, self.boxes[k][0].to_array());
+                let upper = vec3x::splat::<P<S>>(token, self.boxes[k][1].to_array());
+                bits |= meets(token, origin, inverse, lower, upper).bits();
+                counter.node_tests(P::<S>::WIDTH as u32);
+                k += 1;
+            }
+            hidden |= u64::from(bits & sound.bits()) << i;
+            i += P::<S>::WIDTH;
+        }
+        hidden &= pyramid.every();
+        self.worth += 2 * hidden.count_ones() as i32 - pyramid.count as i32;
+        if self.worth < -PATIENCE {
+            self.count = 0;
+        }
+        hidden
+    }
+}
+
+/// Rays that walls may leave free, more than they hide, before they are no longer asked.
+const PATIENCE: i32 = 64;
+
 impl<S: Simd> Bvh<'_, S> {
     /// Which of the segments from `x` to the targets do boxes block?
     ///
@@ -283,12 +343,14 @@ impl<S: Simd> Bvh<'_, S> {
         pyramid.every() & !free
     }
 
-    /// Does one box stand between all points and all targets of a shaft?
+    /// Does one box stand between all points and all targets of a shaft? If none does, `walls` are those that stand
+    /// between their middles.
     #[inline(always)]
     pub(super) fn walled_off(
         &self,
         occluders: &Occluders<'_>,
         shaft: &Shaft,
+        walls: &mut Walls,
         counter: &mut impl Counter,
     ) -> bool {
         type N<S> = <S as Simd>::Node;
@@ -333,10 +395,11 @@ impl<S: Simd> Bvh<'_, S> {
                     pairs = Pairs::of(self.simd, shaft, reach);
                 }
                 let Some((pairs, margin)) = &pairs else { return false };
-                if let Some(occluder) = shrunk(node, place, *margin)
-                    && pairs.all_meet(self.simd, occluder, counter)
-                {
-                    return true;
+                if let Some(occluder) = shrunk(node, place, *margin) {
+                    if pairs.all_meet(self.simd, occluder, counter) {
+                        return true;
+                    }
+                    walls.add(occluder);
                 }
                 candidates += 1;
             }

@@ -6,6 +6,7 @@
 //! that blocked anything for one point are asked first for the next.
 
 use super::batch::{BatchScratch, FEW};
+use super::occluders::Walls;
 use super::packet::{Any, Nobody, Rays, Start};
 use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft};
@@ -283,8 +284,9 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         let shaft = if rays < WORTHWHILE { None } else { self.shaft(points, targets) };
+        let mut walls = Walls::NONE;
         if let (Some(shaft), false, None) = (&shaft, occluders.is_empty(), ignore)
-            && self.walled_off(occluders, shaft, counter)
+            && self.walled_off(occluders, shaft, &mut walls, counter)
         {
             counter.rays(rays as u32);
             let mut k = 0;
@@ -328,7 +330,7 @@ impl<S: Simd> Bvh<'_, S> {
                     {
                         counter.rays(part as u32);
                         let every = batch.pyramid.every();
-                        every & !self.list_leaves(batch, given, false, ignore, counter)
+                        every & !self.list_leaves(batch, given, every, false, ignore, counter)
                     } else {
                         self.packets_from_root(x, targets, from, part, ignore, counter)
                     };
@@ -336,12 +338,17 @@ impl<S: Simd> Bvh<'_, S> {
                 } else {
                     let mut ask = u64::MAX >> (64 - part);
                     let mut word = 0;
-                    if learned.count > 0
-                        && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude)
-                    {
-                        let left = self.list_leaves(batch, learned, true, ignore, counter);
-                        (word, ask) = (ask & !left, left);
+                    let aimed = (learned.count > 0 || !walls.is_empty())
+                        && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude);
+                    if aimed && !walls.is_empty() {
+                        word = walls.hide(self.simd, &batch.pyramid, counter);
+                        ask &= !word;
                         counter.rays(word.count_ones());
+                    }
+                    if aimed && learned.count > 0 && ask != 0 {
+                        let left = self.list_leaves(batch, learned, ask, true, ignore, counter);
+                        counter.rays((ask & !left).count_ones());
+                        (word, ask) = (word | ask & !left, left);
                         if left.count_ones() * 4 > part as u32 {
                             learned.fail();
                         }
@@ -363,18 +370,20 @@ impl<S: Simd> Bvh<'_, S> {
         }
     }
 
-    /// Which of the pyramid's targets the triangles of a list leave free.
+    /// Which of the pyramid's targets, of those asked about, the triangles of a list leave free.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn list_leaves(
         &self,
         batch: &mut BatchScratch,
         list: &mut List,
+        ask: u64,
         may_go: bool,
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
         let pyramid = &batch.pyramid;
-        let mut going = Going::new(pyramid.every());
+        let mut going = Going::new(ask);
         let mut k = 0;
         while k * TriangleBlock::WIDTH < list.count && going.free != 0 {
             let ask = going.free;
