@@ -44,8 +44,8 @@ pub struct RenderArgs {
     #[arg(long, value_enum, default_value_t)]
     method: Method,
 
-    /// Boxes inside closed meshes, which block rays without a look at triangles, for --method exact and map: exact
-    /// gives the same image with and without, map misses fewer blockers with them.
+    /// Boxes inside closed meshes, which block rays without a look at triangles. The exact method gives the same image
+    /// with and without; the map misses fewer blockers with them [default: off for exact, on for map].
     #[arg(long, value_enum, value_name = "SWITCH")]
     volumetric: Option<Switch>,
 
