@@ -7,7 +7,9 @@
 //! between the corners of two boxes all meet an occluder, those between all of their points do.
 //!
 //! Every test is made with a box that is smaller by a bound on all rounding, of itself and of the triangle test, so
-//! that "blocked" is what [`Bvh::occluded`] answers. "Not blocked" means nothing.
+//! that "blocked" is what [`Bvh::occluded`] answers. "Not blocked" means nothing. One thing is left to rounding: where
+//! a segment leaves the mesh within a triangle's plane, to a millionth, the triangle test may place its hit beyond the
+//! segment's end and find nothing; the box still says that it is blocked.
 //!
 //! Djeu, Keely and Hunt, "Accelerating Shadow Rays Using Volumetric Occluders and Modified kd-Tree Traversal" (High
 //! Performance Graphics 2009).
