@@ -116,6 +116,26 @@ fn stochastic_renders_are_written() {
 }
 
 #[test]
+fn boxes_in_columns_change_no_bit() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let columns = scene("columns");
+    let render = |switch: &str| {
+        let (image, stats) = (format!("{switch}.pfm"), format!("{switch}.json"));
+        let args = ["render", &columns, "--size", "96x54", "--spp", "1", "--volumetric", switch];
+        let done = occlude(&[&args[..], &["-o", &image, "--stats", &stats]].concat(), folder.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+        let json = std::fs::read_to_string(folder.path().join(stats)).expect("statistics");
+        let stats: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+        (std::fs::read(folder.path().join(image)).expect("an image"), stats)
+    };
+    let ((with, with_stats), (without, without_stats)) = (render("on"), render("off"));
+    assert!(with == without);
+    assert_eq!(with_stats["volumes"]["boxes"], 25);
+    assert!(with_stats["volumes"]["fraction"].as_f64() > Some(0.9));
+    assert!(without_stats["volumes"].is_null());
+}
+
+#[test]
 fn quiet_is_quiet() {
     let folder = tempfile::tempdir().expect("a folder");
     let args = ["render", &scene("plates"), "-o", "a.png", "--size", "8x8", "--spp", "1", "--quiet"];
@@ -139,6 +159,10 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["render", &cornell, "--eye", "1,2"], "three numbers"),
         (&["render", &cornell, "--reference", "none.exr"], "none.exr"),
         (&["render", &cornell, "--split", "sorted"], "--split is an option of --method stochastic"),
+        (
+            &["render", &cornell, "--method", "stochastic", "--volumetric", "on"],
+            "--volumetric is an option of --method exact and map",
+        ),
         (&["render", &cornell, "--quotas"], "--quotas is an option of --method stochastic"),
         (&["render", &cornell, "--method", "stochastic", "--levels", "3"], "--decomposition residual"),
         (&["render", &cornell, "--method", "stochastic", "--levels", "1"], "--levels"),

@@ -17,5 +17,6 @@ pub mod report;
 pub mod reproduce;
 pub mod sampler;
 pub mod scene;
+pub mod volumetric;
 
 pub use error::{Error, Result};

@@ -1,6 +1,7 @@
 //! Which parts of a scene hang together, and which of them are closed.
 
 use crate::scene::Scene;
+use rayon::prelude::*;
 use std::collections::HashMap;
 
 /// How many connected meshes there are, and of what kind.
@@ -18,15 +19,7 @@ pub struct MeshStats {
 
 /// Sorts a scene's triangles into meshes connected by edges. Vertices in the same place are one vertex.
 pub fn stats(scene: &Scene) -> MeshStats {
-    let mut places: HashMap<[u32; 3], u32> = HashMap::with_capacity(scene.positions.len());
-    let vertex: Vec<u32> = scene
-        .positions
-        .iter()
-        .map(|p| {
-            let next = places.len() as u32;
-            *places.entry(p.to_array().map(|c| (c + 0.0).to_bits())).or_insert(next)
-        })
-        .collect();
+    let vertex = weld(scene);
     // For each edge, its triangles one way and the other, and one of them.
     let mut edges: HashMap<[u32; 2], ([u32; 2], u32)> = HashMap::with_capacity(scene.triangles.len() * 3 / 2);
     let mut parts = Parts::new(scene.triangles.len());
@@ -57,6 +50,88 @@ pub fn stats(scene: &Scene) -> MeshStats {
     }
     stats
 }
+
+/// For each vertex the number of its place: the same for vertices in the same place.
+fn weld(scene: &Scene) -> Vec<u32> {
+    // Adding zero makes one of the two zeros.
+    let place = |p: &glam::Vec3| p.to_array().map(|c| (c + 0.0).to_bits());
+    let mut order: Vec<([u32; 3], u32)> = scene.positions.iter().map(place).zip(0..).collect();
+    order.par_sort_unstable();
+    let mut vertex = vec![0; order.len()];
+    for (number, same) in (0u32..).zip(order.chunk_by(|a, b| a.0 == b.0)) {
+        same.iter().for_each(|&(_, index)| vertex[index as usize] = number);
+    }
+    vertex
+}
+
+/// The closed meshes of a scene: sets of triangles such that every edge belongs to as many of them one way as the
+/// other, so that each has an inside (where it winds around a point) and an outside.
+///
+/// Vertices in the same place are one vertex, and triangles with two corners in one place count for nothing.
+/// Triangles belong together if they share an edge with each other and with no third; only sets that are open by
+/// themselves are taken together with others across edges of more than two. In the order of their first triangles.
+pub fn closed(scene: &Scene) -> Vec<Vec<u32>> {
+    let vertex = weld(scene);
+    // An edge, and a triangle with the way it runs along it in the lowest bit.
+    let mut edges: Vec<([u32; 2], u64)> = Vec::with_capacity(3 * scene.triangles.len());
+    for (triangle, corners) in (0u64..).zip(&scene.triangles) {
+        let [a, b, c] = corners.map(|corner| vertex[corner as usize]);
+        if a != b && b != c && c != a {
+            edges.extend([(a, b), (b, c), (c, a)].map(|(a, b)| {
+                let way = u64::from(a > b);
+                ([a.min(b), a.max(b)], triangle << 1 | way)
+            }));
+        }
+    }
+    edges.par_sort_unstable();
+    let mut found = Vec::new();
+    let mut rest = edges;
+    for by_twos in [true, false] {
+        let mut parts = Parts::new(scene.triangles.len());
+        for edge in rest.chunk_by(|a, b| a.0 == b.0) {
+            if !by_twos || matches!(edge, [a, b] if (a.1 ^ b.1) & 1 == 1) {
+                edge.iter().for_each(|side| parts.join((edge[0].1 >> 1) as u32, (side.1 >> 1) as u32));
+            }
+        }
+        let mut open = vec![false; scene.triangles.len()];
+        for edge in rest.chunk_by(|a, b| a.0 == b.0) {
+            let many = edge.len() > MOST_AT_AN_EDGE;
+            for side in edge {
+                let part = parts.find((side.1 >> 1) as u32);
+                if !open[part as usize] && !many {
+                    let mut balance = 0;
+                    for other in edge {
+                        if parts.find((other.1 >> 1) as u32) == part {
+                            balance += 1 - 2 * (other.1 & 1) as i64;
+                        }
+                    }
+                    open[part as usize] = balance != 0;
+                } else {
+                    open[part as usize] = true;
+                }
+            }
+        }
+        let mut used = vec![false; scene.triangles.len()];
+        rest.iter().for_each(|edge| used[(edge.1 >> 1) as usize] = true);
+        let mut place: HashMap<u32, usize> = HashMap::new();
+        for triangle in (0..scene.triangles.len() as u32).filter(|&triangle| used[triangle as usize]) {
+            let part = parts.find(triangle);
+            if !open[part as usize] {
+                let place = *place.entry(part).or_insert_with(|| {
+                    found.push(Vec::new());
+                    found.len() - 1
+                });
+                found[place].push(triangle);
+            }
+        }
+        rest.retain(|edge| open[parts.find((edge.1 >> 1) as u32) as usize]);
+    }
+    found.sort_unstable_by_key(|triangles| triangles[0]);
+    found
+}
+
+/// Edges of more triangles than this make their meshes open.
+const MOST_AT_AN_EDGE: usize = 64;
 
 /// Sets of triangles that can be joined: union-find with path halving.
 struct Parts(Vec<u32>);

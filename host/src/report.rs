@@ -1,6 +1,7 @@
 //! What a render did, as a table and as JSON.
 
 use crate::error::{Error, Result};
+use crate::volumetric::VolumeStats;
 use serde::Serialize;
 use std::path::Path;
 
@@ -34,6 +35,9 @@ pub struct Report {
     /// The occlusion map, if there was one.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub map: Option<MapFigures>,
+    /// The boxes inside closed meshes, if they were looked for.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub volumes: Option<VolumeFigures>,
     /// Against the reference, if one was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub error: Option<ErrorFigures>,
@@ -123,6 +127,33 @@ pub struct MapFigures {
     pub unknown: u64,
 }
 
+/// The boxes that were found inside closed meshes.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct VolumeFigures {
+    /// Closed meshes.
+    pub closed_meshes: usize,
+    /// Those with boxes that some light may use.
+    pub filled_meshes: usize,
+    /// Boxes.
+    pub boxes: usize,
+    /// The part of the volume of closed meshes that they fill.
+    pub fraction: f64,
+    /// Time to find them, s on the clock.
+    pub build_s: f64,
+}
+
+impl From<&VolumeStats> for VolumeFigures {
+    fn from(stats: &VolumeStats) -> Self {
+        Self {
+            closed_meshes: stats.meshes,
+            filled_meshes: stats.filled_meshes,
+            boxes: stats.boxes,
+            fraction: stats.fraction(),
+            build_s: stats.time.as_secs_f64(),
+        }
+    }
+}
+
 /// How far the image is from a reference.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct ErrorFigures {
@@ -188,6 +219,16 @@ impl Report {
                 part(map.dark),
                 part(map.penumbra),
                 part(map.unknown),
+            );
+        }
+        if let Some(volumes) = &self.volumes {
+            text += &format!(
+                "volumetric: {} boxes in {} of {} closed meshes fill {:.1} % of them, found in {:.3} s\n",
+                volumes.boxes,
+                volumes.filled_meshes,
+                volumes.closed_meshes,
+                100.0 * volumes.fraction,
+                volumes.build_s,
             );
         }
         if let Some(error) = &self.error {

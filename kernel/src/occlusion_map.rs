@@ -73,7 +73,7 @@ impl CellKey {
         key = key << 3 | (2 * axis as u64 + u64::from(normal[axis] < 0.0));
         for at in x.into() {
             let cube = libm::floorf(at * scale);
-            if !(cube >= -8192.0 && cube < 8192.0) {
+            if !(-8192.0..8192.0).contains(&cube) {
                 return None;
             }
             key = key << 14 | (cube as i32 + 8192) as u64;
@@ -187,9 +187,9 @@ impl MapCell {
     /// Takes a point in: where its segments begin. A cell that grows is not lit any more.
     pub fn add(&mut self, x: impl Into<[f32; 3]>) {
         let at = self.turned(x.into().into());
-        for axis in 0..3 {
-            self.lower[axis] = self.lower[axis].min(at[axis]);
-            self.upper[axis] = self.upper[axis].max(at[axis]);
+        for (axis, &at) in at.iter().enumerate() {
+            self.lower[axis] = self.lower[axis].min(at);
+            self.upper[axis] = self.upper[axis].max(at);
         }
         if self.state == LIT {
             self.state = NOTHING;
@@ -277,12 +277,12 @@ impl MapCell {
         let mut expected = [0.0; BINS];
         // Sums of threes along the rows, and then of these along the columns.
         let mut rows = [[0.0; 2]; BINS];
-        for bin in 0..BINS {
+        for (bin, row) in rows.iter_mut().enumerate() {
             let column = bin % BIN_EDGE;
             let mut at = bin - usize::from(column > 0);
             while at <= bin + usize::from(column + 1 < BIN_EDGE) {
-                rows[bin][0] += tallies[at].asked as f32;
-                rows[bin][1] += tallies[at].free as f32;
+                row[0] += tallies[at].asked as f32;
+                row[1] += tallies[at].free as f32;
                 at += 1;
             }
         }

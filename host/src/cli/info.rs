@@ -5,6 +5,7 @@ use super::render::CameraArgs;
 use crate::accel::{Accel, Quality};
 use crate::error::Result;
 use crate::light::{self, Shape};
+use crate::volumetric::Volumes;
 use crate::{mesh, scene};
 use clap::Args;
 use occlude_kernel::lanes::{Level, detect, level_name, levels};
@@ -136,6 +137,18 @@ fn scene_info(path: &std::path::Path, args: &InfoArgs) -> Result<String> {
     if lights.len() > SHOWN {
         line("", format!("and {} more", lights.len() - SHOWN));
     }
+    let volumes = Volumes::build(&scene, &lights).stats;
+    line(
+        "solid boxes",
+        format!(
+            "{} in {} of {} closed meshes, {:.1} % of their volume, found in {:.3} s",
+            volumes.boxes,
+            volumes.filled_meshes,
+            volumes.meshes,
+            100.0 * volumes.fraction(),
+            volumes.time.as_secs_f64()
+        ),
+    );
     line("loaded in", format!("{load:.3} s"));
     line("tree built in", format!("{build:.3} s"));
     line(

@@ -3,7 +3,10 @@
 use crate::accel::Quality;
 use crate::error::{Error, Result};
 use crate::integrator::{MapOptions, PreparedMap, Stage};
+use crate::light::AreaLight;
 use crate::photons::BlockerKind;
+use crate::scene::Scene;
+use crate::volumetric::Volumes;
 use clap::Args;
 
 /// The occlusion map's options.
@@ -57,11 +60,19 @@ impl MapArgs {
     }
 }
 
-/// Shoots the photons.
-pub fn prepare(stage: &Stage<'_>, options: &MapOptions, threads: usize) -> Result<PreparedMap> {
-    let pool = rayon::ThreadPoolBuilder::new()
+/// Finds the boxes inside closed meshes.
+pub fn volumes(scene: &Scene, lights: &[AreaLight], threads: usize) -> Result<Volumes> {
+    Ok(pool(threads)?.install(|| Volumes::build(scene, lights)))
+}
+
+fn pool(threads: usize) -> Result<rayon::ThreadPool> {
+    rayon::ThreadPoolBuilder::new()
         .num_threads(threads)
         .build()
-        .map_err(|error| Error::Usage(format!("cannot start {threads} threads: {error}")))?;
-    Ok(pool.install(|| PreparedMap::new(stage, options)))
+        .map_err(|error| Error::Usage(format!("cannot start {threads} threads: {error}")))
+}
+
+/// Shoots the photons.
+pub fn prepare(stage: &Stage<'_>, options: &MapOptions, threads: usize) -> Result<PreparedMap> {
+    Ok(pool(threads)?.install(|| PreparedMap::new(stage, options)))
 }

@@ -528,7 +528,8 @@ impl Visibility for Auto {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
         let mut work = Counts::default();
         let first = map.passes == 0;
-        let blocked = exact::blocked(&Stage { count: stage.count || first, ..*stage }, questions, &mut work);
+        let blocked =
+            exact::blocked(&Stage { count: stage.count || first, ..*stage }, &[], questions, &mut work);
         if stage.count {
             *counts += work;
         }

@@ -3,7 +3,7 @@
 use super::{Questions, Stage, Visibility};
 use crate::light::AreaLight;
 use occlude_kernel::lanes::{Task, dispatch};
-use occlude_kernel::{Bvh, Counter, Counts, Simd, Targets, TilePoint, TileScratch, Uncounted};
+use occlude_kernel::{Bvh, Counter, Counts, Occluders, Simd, Targets, TilePoint, TileScratch, Uncounted};
 
 /// Traces every shadow ray through the scene's tree, a tile and a light at a time.
 #[derive(Clone, Copy, Debug, Default)]
@@ -17,24 +17,68 @@ impl Visibility for Exact {
         estimates: &mut Vec<f32>,
         counts: &mut Counts,
     ) {
-        let blocked = blocked(stage, questions, counts);
-        estimates.clear();
-        let free = |i: usize| blocked[i / 64] >> (i % 64) & 1 == 0;
-        estimates.extend((0..questions.weights.len()).map(|i| if free(i) { 1.0 } else { 0.0 }));
+        trace(stage, &[], questions, estimates, counts);
     }
 }
 
+/// The same answers as of [`Exact`], but where a box inside a closed mesh stands between all of a tile and all of a
+/// light, nothing is traced.
+#[derive(Clone, Debug, Default)]
+pub struct Walled<'a> {
+    occluders: Vec<Occluders<'a>>,
+}
+
+impl<'a> Walled<'a> {
+    /// With the boxes for each light, such as those of [`crate::volumetric::Volumes::occluders`].
+    pub fn new(occluders: Vec<Occluders<'a>>) -> Self {
+        Self { occluders }
+    }
+}
+
+impl Visibility for Walled<'_> {
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        trace(stage, &self.occluders, questions, estimates, counts);
+    }
+}
+
+fn trace(
+    stage: &Stage<'_>,
+    occluders: &[Occluders<'_>],
+    questions: &Questions,
+    estimates: &mut Vec<f32>,
+    counts: &mut Counts,
+) {
+    let blocked = blocked(stage, occluders, questions, counts);
+    estimates.clear();
+    let free = |i: usize| blocked[i / 64] >> (i % 64) & 1 == 0;
+    estimates.extend((0..questions.weights.len()).map(|i| if free(i) { 1.0 } else { 0.0 }));
+}
+
 /// Which samples are blocked, a bit each.
-pub(super) fn blocked(stage: &Stage<'_>, questions: &Questions, counts: &mut Counts) -> Vec<u64> {
+pub(super) fn blocked(
+    stage: &Stage<'_>,
+    occluders: &[Occluders<'_>],
+    questions: &Questions,
+    counts: &mut Counts,
+) -> Vec<u64> {
     let groups = groups(questions);
     let mut blocked = vec![0; questions.weights.len().div_ceil(64)];
     let (bvh, lights) = (stage.bvh, stage.lights);
     let (groups, words) = (groups.as_slice(), blocked.as_mut_slice());
     if stage.count {
-        dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter: counts });
+        let counter = counts;
+        let trace = Trace { bvh, lights, occluders, questions, groups, blocked: words, counter };
+        dispatch(stage.level, trace);
     } else {
         let counter = &mut Uncounted;
-        dispatch(stage.level, Trace { bvh, lights, questions, groups, blocked: words, counter });
+        let trace = Trace { bvh, lights, occluders, questions, groups, blocked: words, counter };
+        dispatch(stage.level, trace);
     }
     blocked
 }
@@ -81,6 +125,8 @@ fn groups(questions: &Questions) -> Vec<Group> {
 struct Trace<'a, C> {
     bvh: Bvh<'a>,
     lights: &'a [AreaLight],
+    /// For each light; or none at all.
+    occluders: &'a [Occluders<'a>],
     questions: &'a Questions,
     groups: &'a [Group],
     blocked: &'a mut [u64],
@@ -99,7 +145,12 @@ impl<C: Counter> Task for Trace<'_, C> {
         for group in self.groups {
             let light = &self.lights[group.light as usize];
             let targets = targets.on_parallelogram(light.corner, light.u, light.v);
-            bvh.occluded_tile(&group.points, &targets, None, self.counter, &mut scratch, self.blocked);
+            let occluders = match self.occluders.get(group.light as usize) {
+                Some(occluders) => occluders,
+                None => &Occluders::NONE,
+            };
+            let (points, counter) = (&group.points[..], &mut *self.counter);
+            bvh.occluded_tile_with(occluders, points, &targets, None, counter, &mut scratch, self.blocked);
         }
     }
 }

@@ -14,7 +14,7 @@ use crate::report::MapFigures;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::photons::{Class, Nearest, Neighbour, Photons, Place};
 use occlude_kernel::{
-    BatchScratch, Bvh, Child, Counter, Counts, Native, Simd, Targets, TriangleBlock, Uncounted,
+    BatchScratch, Bvh, Child, Counter, Counts, Native, Occluders, Simd, Targets, TriangleBlock, Uncounted,
 };
 use std::f32::consts::FRAC_1_PI;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -76,7 +76,8 @@ impl PreparedMap {
             BlockerSet::Objects(_, trees) => trees.iter().map(|tree| tree.bvh()).collect(),
             _ => Vec::new(),
         };
-        Map { prepared: self, photons: self.store.by_light(), objects, classes: Default::default() }
+        let photons = self.store.by_light();
+        Map { prepared: self, photons, objects, occluders: Vec::new(), classes: Default::default() }
     }
 
     /// Where to look for the photons of a light around a point of a surface.
@@ -131,10 +132,16 @@ pub struct Map<'a> {
     prepared: &'a PreparedMap,
     photons: Vec<Photons<'a, Native>>,
     objects: Vec<Bvh<'a>>,
+    occluders: Vec<Occluders<'a>>,
     classes: Classes,
 }
 
-impl Map<'_> {
+impl<'a> Map<'a> {
+    /// With boxes that block the light of each light, whatever photons name (see [`crate::volumetric`]).
+    pub fn with_occluders(self, occluders: Vec<Occluders<'a>>) -> Self {
+        Self { occluders, ..self }
+    }
+
     /// What the batches asked so far were.
     pub fn classes(&self) -> &Classes {
         &self.classes
@@ -183,6 +190,7 @@ impl<C: Counter> Task for Ask<'_, C> {
         let mut room = vec![0; ROOM];
         let mut tracer = Tracer { blocks: Vec::new(), roots: Vec::new(), scratch: BatchScratch::new() };
         let mut blocked = [0u64; MOST / 64];
+        let mut hidden = [0u64; MOST / 64];
         let mut classes = [0; 4];
         let [x, y, z] = &questions.targets;
         for batch in &questions.batches {
@@ -228,6 +236,17 @@ impl<C: Counter> Task for Ask<'_, C> {
                 };
                 let targets = targets.on_parallelogram(light.corner, light.u, light.v);
                 let words = &mut blocked[..count.div_ceil(64)];
+                let behind = &mut hidden[..count.div_ceil(64)];
+                behind.fill(0);
+                if let (Some(boxes), Some(_)) = (map.occluders.get(batch.light as usize), list) {
+                    bvh.hidden_batch(boxes, point.origin, &targets, counter, &mut tracer.scratch, behind);
+                }
+                let ones: u32 = behind.iter().map(|word| word.count_ones()).sum();
+                if ones as usize == count {
+                    counter.rays(ones);
+                    estimates.resize(estimates.len() + count, 0.0);
+                    continue;
+                }
                 match list {
                     None => {
                         bvh.occluded_batch(point.origin, &targets, None, counter, &mut tracer.scratch, words)
@@ -239,7 +258,8 @@ impl<C: Counter> Task for Ask<'_, C> {
                     }
                 }
                 for i in 0..count {
-                    estimates.push(if blocked[i / 64] >> (i % 64) & 1 == 0 { 1.0 } else { 0.0 });
+                    let word = blocked[i / 64] | hidden[i / 64];
+                    estimates.push(if word >> (i % 64) & 1 == 0 { 1.0 } else { 0.0 });
                 }
             }
         }

@@ -9,7 +9,7 @@ mod map;
 mod stochastic;
 
 pub use auto::{Auto, AutoOptions};
-pub use exact::Exact;
+pub use exact::{Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 

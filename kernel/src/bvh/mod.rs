@@ -6,6 +6,7 @@
 //! | which triangle? | [`Bvh::occluder`] | [`Bvh::occluder_packet`] | | |
 //! | the nearest one | [`Bvh::closest`] | [`Bvh::closest_packet`] | | |
 //! | all of them | [`Bvh::each_hit`], [`Bvh::each_hit_in_order`] | [`Bvh::each_hit_packet`] | | |
+//! | do boxes inside of closed meshes block it? | | | [`Bvh::hidden_batch`] | [`Bvh::occluded_tile_with`] |
 //! | is any of these there? | [`Bvh::occluded_among`] | | [`Bvh::occluded_batch_among`], [`Bvh::occluded_batch_by`] | |
 //!
 //! Which to use: for shadows, the tile wherever points come in neighbourhoods (about 8 by 8 pixels or texels at several
@@ -18,6 +19,7 @@
 //! the triangle, and a hit that rounding puts outside the box counts only if `t_min` and `t_max` let its box count.
 
 mod batch;
+mod occluders;
 mod packet;
 mod part;
 mod pyramid;
@@ -27,6 +29,7 @@ mod slabs;
 mod tile;
 
 pub use batch::{BatchScratch, Targets};
+pub use occluders::Occluders;
 pub use packet::HitPacket;
 pub use part::Part;
 pub use tile::{TilePoint, TileScratch};
@@ -292,6 +295,14 @@ fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
             }
         }
     }
+    check_nodes(nodes, blocks.len())
+}
+
+/// The nodes alone; leaves have indices below `leaves`.
+fn check_nodes(nodes: &[Node], leaves: usize) -> Result<(), BvhError> {
+    if nodes.len() > Child::MAX_INDEX as usize {
+        return Err(BvhError::TooMany);
+    }
     for (index, node) in nodes.iter().enumerate() {
         for place in 0..Node::WIDTH {
             let child = node.children[place];
@@ -299,7 +310,7 @@ fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
                 continue;
             }
             let at = (index as u32, place as u32);
-            let there = if child.is_leaf() { blocks.len() } else { nodes.len() };
+            let there = if child.is_leaf() { leaves } else { nodes.len() };
             if child.index() >= there {
                 return Err(BvhError::OutOfRange { node: at.0, place: at.1 });
             }

@@ -51,16 +51,16 @@ pub(super) type Stack = ArrayVec<(Child, f32, u64), STACK>;
 
 /// Up to 64 targets as seen from x.
 pub(super) struct Pyramid {
-    x: Vec3,
+    pub(super) x: Vec3,
     /// The linear functions S, T and W, by rows.
     rows: [Vec3; 3],
     /// Directions to the targets, by axis.
-    direction: [[f32; MOST]; 3],
+    pub(super) direction: [[f32; MOST]; 3],
     /// Targets in the pyramid's coordinates.
     s: [f32; MOST],
     t: [f32; MOST],
     w: [f32; MOST],
-    count: usize,
+    pub(super) count: usize,
     /// For each axis, the targets whose direction is longest along it.
     along: [u64; 3],
     /// Least and greatest s, t and w.
@@ -78,7 +78,7 @@ pub(super) struct Pyramid {
     /// Directions to the corners of the rectangle at the least and the greatest depth.
     corners: [Vec3; 8],
     /// The greatest component of a direction to a target.
-    farthest: f32,
+    pub(super) farthest: f32,
     /// The box around x and the targets.
     lower: Vec3,
     upper: Vec3,
@@ -289,7 +289,7 @@ impl Pyramid {
 
     /// Which children of a node the pyramid may meet, and how deep each begins.
     #[inline(always)]
-    fn children<S: Simd>(&self, simd: S, node: &Node, depth: &mut [f32; 8]) -> u32 {
+    pub(super) fn children<S: Simd>(&self, simd: S, node: &Node, depth: &mut [f32; 8]) -> u32 {
         type N<S> = <S as Simd>::Node;
         let token = simd.token();
         let mut met = 0;

@@ -96,15 +96,16 @@ const PLANES: usize = 10;
 /// Where anything must be to come between the points and the targets.
 pub(super) struct Shaft {
     /// What the corners are counted from.
-    reference: Vec3,
+    pub(super) reference: Vec3,
     /// From the middle of the points to that of the targets.
-    between: Vec3,
+    pub(super) between: Vec3,
     planes: [Plane; PLANES],
     lower: Vec3,
     upper: Vec3,
-    corners: [Vec3; 16],
+    /// Eight around the points and eight around the targets; `k` and `k ^ 4` are where a flat box is thin.
+    pub(super) corners: [Vec3; 16],
     /// The greatest component of a corner around the points, and around the targets.
-    farthest: [f32; 2],
+    pub(super) farthest: [f32; 2],
 }
 
 impl Shaft {

@@ -6,10 +6,11 @@
 //! that blocked anything for one point are asked first for the next.
 
 use super::batch::{BatchScratch, FEW};
+use super::occluders::Walls;
 use super::packet::{Any, Nobody, Rays, Start};
 use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft};
-use super::{Bvh, CUT, Child, Node, Targets};
+use super::{Bvh, CUT, Child, Node, Occluders, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::triangle::{NO_TRIANGLE, TriangleBlock};
@@ -254,6 +255,26 @@ impl<S: Simd> Bvh<'_, S> {
         scratch: &mut TileScratch,
         blocked: &mut [u64],
     ) {
+        self.occluded_tile_with(&Occluders::NONE, points, targets, ignore, counter, scratch, blocked);
+    }
+
+    /// The same answers, quicker where one of these boxes stands between all of the points and all of the targets:
+    /// then no ray is traced.
+    ///
+    /// The targets must be outside the meshes that the boxes are inside of (see [`Occluders`]). With a triangle to
+    /// ignore the boxes are not asked, as it may be of such a mesh.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    pub fn occluded_tile_with(
+        &self,
+        occluders: &Occluders<'_>,
+        points: &[TilePoint],
+        targets: &Targets<'_>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        scratch: &mut TileScratch,
+        blocked: &mut [u64],
+    ) {
         let mut rays = 0;
         let mut k = 0;
         while k < points.len() {
@@ -267,6 +288,18 @@ impl<S: Simd> Bvh<'_, S> {
         }
         let shaft =
             if rays < WORTHWHILE { None } else { self.shaft(points, targets, frame_of_points(points)) };
+        let mut walls = Walls::NONE;
+        if let (Some(shaft), false, None) = (&shaft, occluders.is_empty(), ignore)
+            && self.walled_off(occluders, shaft, &mut walls, counter)
+        {
+            counter.rays(rays as u32);
+            let mut k = 0;
+            while k < points.len() {
+                let (first, end) = run(points, &mut k);
+                fill(blocked, first, end - first);
+            }
+            return;
+        }
         let TileScratch { batch, cut, given, learned, packet } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
@@ -301,7 +334,7 @@ impl<S: Simd> Bvh<'_, S> {
                     {
                         counter.rays(part as u32);
                         let every = batch.pyramid.every();
-                        every & !self.list_leaves(batch, given, false, ignore, counter)
+                        every & !self.list_leaves(batch, given, every, false, ignore, counter)
                     } else {
                         self.packets_from_root(x, targets, from, part, ignore, counter)
                     };
@@ -309,12 +342,17 @@ impl<S: Simd> Bvh<'_, S> {
                 } else {
                     let mut ask = u64::MAX >> (64 - part);
                     let mut word = 0;
-                    if learned.count > 0
-                        && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude)
-                    {
-                        let left = self.list_leaves(batch, learned, true, ignore, counter);
-                        (word, ask) = (ask & !left, left);
+                    let aimed = (learned.count > 0 || !walls.is_empty())
+                        && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude);
+                    if aimed && !walls.is_empty() {
+                        word = walls.hide(self.simd, &batch.pyramid, counter);
+                        ask &= !word;
                         counter.rays(word.count_ones());
+                    }
+                    if aimed && learned.count > 0 && ask != 0 {
+                        let left = self.list_leaves(batch, learned, ask, true, ignore, counter);
+                        counter.rays((ask & !left).count_ones());
+                        (word, ask) = (word | ask & !left, left);
                         if left.count_ones() * 4 > part as u32 {
                             learned.fail();
                         }
@@ -336,18 +374,20 @@ impl<S: Simd> Bvh<'_, S> {
         }
     }
 
-    /// Which of the pyramid's targets the triangles of a list leave free.
+    /// Which of the pyramid's targets, of those asked about, the triangles of a list leave free.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn list_leaves(
         &self,
         batch: &mut BatchScratch,
         list: &mut List,
+        ask: u64,
         may_go: bool,
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
         let pyramid = &batch.pyramid;
-        let mut going = Going::new(pyramid.every());
+        let mut going = Going::new(ask);
         let mut k = 0;
         while k * TriangleBlock::WIDTH < list.count && going.free != 0 {
             let ask = going.free;
@@ -660,6 +700,18 @@ fn clear(blocked: &mut [u64], first: usize, count: usize) {
     while i < end {
         let (bit, part) = (i % 64, (end - i).min(64 - i % 64));
         blocked[i / 64] &= !((u64::MAX >> (64 - part)) << bit);
+        i += part;
+    }
+}
+
+/// Sets the bits of `count` targets from the `first`th on.
+#[inline(always)]
+fn fill(blocked: &mut [u64], first: usize, count: usize) {
+    let mut i = first;
+    let end = first + count;
+    while i < end {
+        let (bit, part) = (i % 64, (end - i).min(64 - i % 64));
+        blocked[i / 64] |= (u64::MAX >> (64 - part)) << bit;
         i += part;
     }
 }
