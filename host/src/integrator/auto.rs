@@ -9,12 +9,13 @@ use super::{Fan, Questions, Scratch, Share, Stage, Visibility, cast, divide, exa
 use crate::film::Tile;
 use crate::light::AreaLight;
 use crate::photons::{BlockerSet, Shower};
+use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::occlusion_map::{
     BINS, CLASSES, CellKey, Chances, Coin, Doubts, Known, MapCell, OcclusionMap, Tally, bin, class,
 };
-use occlude_kernel::{Bvh, Counts, Hit, Simd, Targets, TileScratch, Uncounted, offset};
+use occlude_kernel::{Bvh, Counts, Hit, Ray, Simd, Targets, TileScratch, Uncounted, offset};
 use rayon::prelude::*;
 use std::f32::consts::FRAC_1_PI;
 use std::ops::{ControlFlow, Range};
@@ -48,8 +49,8 @@ pub struct Auto {
     map: RwLock<Map>,
     /// Points of cells that there are not, or beyond the bounds of a cell that is lit.
     strays: Mutex<Vec<Stray>>,
-    /// How far this pass' guesses are off, and what its rays take.
-    doubts: Mutex<(Doubts, Counts)>,
+    /// How far this pass' guesses are off.
+    doubts: Mutex<Doubts>,
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -85,8 +86,8 @@ struct Map {
     /// And what follows from that.
     chances: Chances,
     passes: u32,
-    /// What the rays of the first pass took.
-    work: Counts,
+    /// About what a shadow ray costs, ns.
+    ray: f64,
     /// Is there room for no more cells?
     full: bool,
 }
@@ -104,7 +105,7 @@ impl Default for Map {
             doubts: Doubts::default(),
             chances: Chances::ALL,
             passes: 0,
-            work: Counts::default(),
+            ray: 4.0,
             full: false,
         }
     }
@@ -242,7 +243,7 @@ impl Map {
             }
         }
         // What a ray costs when all are asked, and what one costs that was chosen; ns.
-        let ray = self.ray_cost();
+        let ray = self.ray;
         let chosen = SCATTERED * ray + CHOSEN;
         self.chances = self.doubts.chances(&segments, unknown, SKIPPED / chosen, SPREAD);
         self.doubts.fade();
@@ -253,13 +254,29 @@ impl Map {
         cells.for_each(|(cell, expected)| cell.learn(expected.as_ref(), &chances, most));
     }
 
-    /// About what a shadow ray of the first pass cost, ns. From its tests and not from a clock, so that pictures do not
-    /// depend on who else uses the machine: fitted to the times of nine scenes of 68 to 10^5 triangles.
-    fn ray_cost(&self) -> f64 {
-        let rays = self.work.rays.max(1) as f64;
-        4.0 + 1.8 * self.work.node_tests as f64 / rays + 2.0 * self.work.triangle_tests as f64 / rays
+    /// About what a shadow ray costs where not all is lit, ns: from the tests of some rays and not from a clock, so that
+    /// pictures do not depend on who else uses the machine, and rounded to a quarter of an octave, so that a bit more
+    /// or less of rounding in a box test does not matter. Fitted to the times of ten scenes of 8 to 10^5 triangles.
+    fn probe(&mut self, strays: &[Stray], stage: &Stage<'_>) {
+        let view = self.view();
+        let unproven = |stray: &&Stray| view.find(stray.key).is_none_or(|cell| !view.cells()[cell].is_lit());
+        let mut counts = Counts::default();
+        for (k, stray) in (0..).zip(strays.iter().step_by(strays.len() / PROBES + 1).filter(unproven)) {
+            let light = &stage.lights[stray.key.light() as usize];
+            let mut sampler = Sampler::from_key(stage.seed ^ k);
+            let y = light.point([sampler.uniform(), sampler.uniform()]);
+            let y = offset(y, light.normal, stage.bvh.clearance());
+            stage.bvh.occluded(&Ray::segment(stray.origin, y), None, &mut counts);
+        }
+        let each = |count: u64| count as f64 / counts.rays.max(1) as f64;
+        let tests = each(counts.node_tests) + each(counts.triangle_tests);
+        let cost = (0.2 * tests.powf(1.4)).max(3.0);
+        self.ray = 2f64.powf((4.0 * cost.log2()).round() / 4.0);
     }
 }
+
+/// Rays to see what rays cost.
+const PROBES: usize = 4096;
 
 /// Passes before cells that are all doubt are left alone.
 const FOR_GOOD: u32 = 3;
@@ -318,6 +335,14 @@ impl Auto {
     /// With nothing known yet.
     pub fn new(options: AutoOptions) -> Self {
         Self { options, ..Self::default() }
+    }
+
+    /// Lets somebody change what the map thinks, between passes. Whatever it thinks, pictures stay right on average, as
+    /// long as no cell is called lit that is not.
+    pub fn alter(&self, change: impl FnOnce(&mut [MapCell], &mut Chances)) {
+        let mut map = self.map.write().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let Map { cells, chances, .. } = &mut *map;
+        change(cells, chances);
     }
 
     /// Shoots photons at the cells, and counts which of them light reaches.
@@ -420,9 +445,11 @@ impl Visibility for Auto {
                 strays
             })
             .collect();
-        map.take_in(strays.concat(), stage, &self.options);
+        let strays = strays.concat();
+        map.take_in(strays.clone(), stage, &self.options);
         self.seed(&map, stage);
         map.prove(stage);
+        map.probe(&strays, stage);
         map.learn();
     }
 
@@ -526,13 +553,7 @@ impl Visibility for Auto {
         counts: &mut Counts,
     ) {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
-        let mut work = Counts::default();
-        let first = map.passes == 0;
-        let blocked =
-            exact::blocked(&Stage { count: stage.count || first, ..*stage }, &[], questions, &mut work);
-        if stage.count {
-            *counts += work;
-        }
+        let blocked = exact::blocked(stage, &[], questions, counts);
         estimates.clear();
         let mut doubts = Doubts::default();
         for (i, (odds, &place)) in questions.odds.iter().zip(&questions.places).enumerate() {
@@ -549,9 +570,7 @@ impl Visibility for Auto {
                 map.count(place as usize, free);
             }
         }
-        let mut sums = self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-        sums.0.merge(&doubts);
-        sums.1 += work;
+        self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
     }
 
     fn passed(&self, stage: &Stage<'_>) {
@@ -562,12 +581,9 @@ impl Visibility for Auto {
             map.take_in(strays, stage, &self.options);
         }
         map.passes += 1;
-        let (doubts, work) =
+        let doubts =
             std::mem::take(&mut *self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()));
         map.doubts.merge(&doubts);
-        if map.passes == 1 {
-            map.work = work;
-        }
         map.prove(stage);
         if worth_learning(map.passes) {
             map.learn();

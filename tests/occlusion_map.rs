@@ -1,0 +1,427 @@
+//! The occlusion map that learns: its parts by arithmetic and enumeration, its pictures against exact ones.
+
+use glam::Vec3;
+use occlude_host::accel::{Accel, Quality};
+use occlude_host::film::{Film, Image};
+use occlude_host::integrator::{Auto, AutoOptions, Exact, Scratch, Stage, Visibility, render_tile};
+use occlude_host::light::{self, AreaLight};
+use occlude_host::render::{Limits, render};
+use occlude_host::sampler::Pattern;
+use occlude_host::scene::{Camera, CameraRequest, Scene, load};
+use occlude_kernel::lanes::{Level, detect, levels};
+use occlude_kernel::occlusion_map::{
+    BINS, CLASSES, CellKey, Chances, Coin, Doubts, Known, LEAST_CHANCE, MapCell, OcclusionMap, Odds, Tally,
+    bin, class,
+};
+use occlude_kernel::{Ray, Targets, TileScratch, Uncounted};
+use occlude_tests::Random;
+use std::path::Path;
+use std::sync::atomic::AtomicBool;
+
+#[test]
+fn over_all_starts_every_segment_is_asked_with_its_chance_and_corrected_to_its_visibility() {
+    let mut random = Random::new(1);
+    for _ in 0..200 {
+        let odds: Vec<Odds> = (0..40)
+            .map(|_| Odds { u: (random.unit() * 256.0) as u8, class: (random.unit() * 16.0) as u8 })
+            .collect();
+        let chances = {
+            let mut doubts = Doubts::default();
+            for class in 0..CLASSES {
+                doubts.asked[class] = 1 << 30;
+                doubts.squared[class] = (random.unit().powi(4) * 65025.0 * 2f32.powi(28)) as u64;
+            }
+            doubts.chances(&[1000; CLASSES], 0, 0.1, 0.06)
+        };
+        let mut asked = [0u32; 40];
+        let mut sums = [[0.0f64; 2]; 40];
+        for start in 0..LEAST_CHANCE {
+            let mut coin = Coin::new((start as f32 + random.unit()) / LEAST_CHANCE as f32);
+            for (i, odds) in odds.iter().enumerate() {
+                let toss = coin.toss(chances.of(odds.class));
+                asked[i] += u32::from(toss);
+                for free in [false, true] {
+                    let correction = if toss { odds.correction(&chances, free) } else { 0.0 };
+                    sums[i][usize::from(free)] += f64::from(odds.guess()) + f64::from(correction);
+                }
+            }
+        }
+        for (i, odds) in odds.iter().enumerate() {
+            assert_eq!(asked[i], u32::from(chances.of(odds.class)));
+            for free in [0, 1] {
+                let mean = sums[i][free] / f64::from(LEAST_CHANCE);
+                assert!((mean - free as f64).abs() < 1e-5, "{odds:?}: {mean} for {free}");
+            }
+        }
+    }
+}
+
+#[test]
+fn keys_tell_cubes_sides_and_lights_apart() {
+    let key = |x: [f32; 3], n: [f32; 3], level, light| CellKey::new(x, n, level, light);
+    let (up, down) = ([0.1, 0.9, 0.2], [0.1, -0.9, 0.2]);
+    let first = key([0.3, 0.6, -0.1], up, -1, 3).expect("near");
+    assert_eq!(key([0.4, 0.9, -0.4], up, -1, 3), Some(first), "the same cube of half a metre");
+    assert_eq!(first.light(), 3);
+    let others = [
+        key([0.6, 0.6, -0.1], up, -1, 3),
+        key([0.3, 0.4, -0.1], up, -1, 3),
+        key([0.3, 0.6, 0.1], up, -1, 3),
+        key([0.3, 0.6, -0.1], down, -1, 3),
+        key([0.3, 0.6, -0.1], [0.9, 0.1, 0.2], -1, 3),
+        key([0.3, 0.6, -0.1], up, 0, 3),
+        key([0.3, 0.6, -0.1], up, -1, 4),
+    ];
+    for (k, other) in others.iter().enumerate() {
+        assert!(other.is_some() && *other != Some(first), "{k}");
+        assert!(!others[..k].contains(other), "{k}");
+    }
+    let nothing = [
+        key([8193.0, 0.0, 0.0], up, 0, 0),
+        key([0.0, -8193.0, 0.0], up, 0, 0),
+        key([f32::NAN, 0.0, 0.0], up, 0, 0),
+        key([0.0, f32::INFINITY, 0.0], up, 0, 0),
+        key([0.0; 3], up, 32, 0),
+        key([0.0; 3], up, -33, 0),
+        key([0.0; 3], up, 0, CellKey::LIGHTS),
+        key([0.0; 3], up, CellKey::level(f32::NAN), 0),
+        key([0.0; 3], up, CellKey::level(0.0), 0),
+    ];
+    assert!(nothing.iter().all(Option::is_none));
+    for (size, level) in [(1.0, 0), (1.01, 1), (0.5, -1), (0.26, -1), (3.0, 2), (4.0, 2)] {
+        assert_eq!(CellKey::level(size), level, "{size}");
+    }
+}
+
+#[test]
+fn cells_are_found_and_damaged_tables_find_less() {
+    let mut random = Random::new(2);
+    let cells: Vec<MapCell> = (0..500)
+        .filter_map(|_| {
+            let at = [random.unit() * 50.0, random.unit() * 50.0, random.unit() * 50.0];
+            Some(MapCell::new(CellKey::new(at, [0.0, 0.0, 1.0], -2, 0)?, [0.0, 0.0, 1.0]))
+        })
+        .collect();
+    let mut table = vec![0; OcclusionMap::table(cells.len())];
+    OcclusionMap::index(&cells, &mut table);
+    let map = OcclusionMap::new(&cells, &table).expect("a power of 2");
+    for cell in &cells {
+        let first = cells.iter().position(|other| other.key() == cell.key());
+        assert_eq!(map.find(cell.key()), first);
+    }
+    let absent = CellKey::new([-1.0; 3], [0.0, 0.0, 1.0], -2, 0).expect("near");
+    assert_eq!(map.find(absent), None);
+    assert_eq!(OcclusionMap::EMPTY.find(absent), None);
+    assert!(OcclusionMap::new(&cells, &table[1..]).is_err());
+    assert!(OcclusionMap::new(&cells, &[]).is_err());
+    // A table with no end, and one of numbers beyond the cells.
+    let full = vec![0; 8];
+    let wild = vec![7_000_000; 8];
+    for table in [&full, &wild] {
+        assert_eq!(OcclusionMap::new(&cells, table).expect("a power of 2").find(absent), None);
+    }
+}
+
+#[test]
+fn bins_cut_the_square_evenly() {
+    for k in 0..BINS {
+        let at = |i: usize| (i as f32 + 0.5) / 8.0;
+        assert_eq!(bin([at(k % 8), at(k / 8)]), k);
+    }
+    assert_eq!(bin([0.0, 0.0]), 0);
+    assert_eq!(bin([1.0 - f32::EPSILON / 2.0; 2]), BINS - 1);
+    for k in 0..CLASSES {
+        // 4 p (1 - p) = 1.5 · 2^-(k + 1), in the middle of a class.
+        let p = 0.5 - 0.5 * (1.0 - 0.75 * 0.5f32.powi(k as i32)).sqrt();
+        assert_eq!(class(p), k, "{p}");
+    }
+    assert_eq!([class(0.0), class(1.0), class(1e-30)], [CLASSES - 1; 3]);
+}
+
+#[test]
+fn cells_learn_what_they_saw() {
+    let key = CellKey::new([0.0; 3], [0.0, 0.0, 1.0], 0, 0).expect("near");
+    let mut cell = MapCell::new(key, [0.0, 0.0, 1.0]);
+    let chances = Chances::each(4);
+    let mut tallies = [Tally::default(); BINS];
+    assert_eq!(MapCell::expect(&tallies), None, "nothing seen");
+    cell.learn(None, &chances, 1.0);
+    assert_eq!(cell.known([0.0; 3]), Known::Nothing);
+    // Free to the left, dark to the right.
+    for (k, tally) in tallies.iter_mut().enumerate() {
+        *tally = Tally { asked: 100, free: if k % 8 < 4 { 100 } else { 0 } };
+    }
+    let expected = MapCell::expect(&tallies).expect("enough");
+    for (k, &p) in expected.iter().enumerate() {
+        let column = k % 8;
+        assert!((0.0..=1.0).contains(&p));
+        assert!(if column < 4 { p > 0.99 } else { p < 0.01 }, "column {column}: {p}");
+    }
+    assert!(class(expected[0]) > class(expected[3]), "near the border there is more doubt");
+    cell.learn(Some(&expected), &chances, 1.0);
+    assert_eq!(cell.known([0.0; 3]), Known::Bins);
+    assert!(cell.odds(0).guess() > 0.99 && cell.odds(7).guess() < 0.01);
+    cell.learn(Some(&expected), &chances, 0.2);
+    assert_eq!(cell.known([0.0; 3]), Known::All, "a quarter is more than a fifth");
+    cell.learn(Some(&[0.0; BINS]), &chances, 1.0);
+    assert_eq!(cell.known([0.0; 3]), Known::Flat(Odds { u: 0, class: CLASSES as u8 - 1 }));
+    // What is proven is not unlearned, and holds within the bounds only.
+    cell.add([0.25, 0.25, 0.0]);
+    cell.set_lit();
+    cell.learn(Some(&[0.5; BINS]), &chances, 1.0);
+    assert_eq!(cell.known([0.25, 0.25, 0.0]), Known::Lit);
+    assert!(matches!(cell.known([0.25, 0.5, 0.0]), Known::Flat(odds) if odds.guess() == 1.0));
+    cell.add([0.25, 0.5, 0.0]);
+    assert!(!cell.is_lit(), "it grew");
+}
+
+#[test]
+fn chances_follow_what_was_measured() {
+    let mut doubts = Doubts::default();
+    assert_eq!(doubts.chances(&[100; CLASSES], 0, 0.1, 0.06), Chances::ALL, "nobody knows");
+    for k in 0..CLASSES {
+        doubts.asked[k] = 1 << 20;
+        doubts.squared[k] = (65025u64 << 20) / 5 >> k;
+    }
+    // Few segments of much doubt, many of little.
+    let segments: [u64; CLASSES] = std::array::from_fn(|k| 100 << (k / 2));
+    let chances = doubts.chances(&segments, 0, 0.05, 0.06);
+    let q: Vec<u8> = (0..CLASSES as u8).map(|class| chances.of(class)).collect();
+    assert!(q.is_sorted_by(|a, b| a >= b), "{q:?}");
+    assert!(q[0] == 16 && q[CLASSES - 1] < 4, "{q:?}");
+    // The product of work and error is no less for any other eagerness.
+    let product = |q: &dyn Fn(usize) -> f64| {
+        let mut sums = [0.0; 2];
+        for k in 0..CLASSES {
+            let (n, variance) = (segments[k] as f64, doubts.variance(k));
+            sums[0] += n * (q(k) + 0.05);
+            sums[1] += n * variance * (0.06 + 1.0 / q(k) - 1.0);
+        }
+        sums[0] * sums[1]
+    };
+    let chosen = product(&|k| f64::from(chances.of(k as u8)) / 16.0);
+    for power in -8..24 {
+        let eagerness = 2f64.powf(0.5 * f64::from(power));
+        let other =
+            product(&|k| ((16.0 * eagerness * doubts.variance(k).sqrt()).ceil().clamp(1.0, 16.0)) / 16.0);
+        assert!(chosen <= other * 1.02, "2^{power}/2: {chosen} and {other}");
+    }
+    let before = doubts;
+    doubts.fade();
+    assert_eq!(doubts.asked[3], before.asked[3] / 2);
+}
+
+struct Setting {
+    scene: Scene,
+    accel: Accel,
+    lights: Vec<AreaLight>,
+    camera: Camera,
+}
+
+impl Setting {
+    fn own(name: &str, size: (u32, u32)) -> Self {
+        let folder = Path::new(env!("CARGO_MANIFEST_DIR")).join("../scenes").join(name);
+        let request = CameraRequest { size: Some(size), ..CameraRequest::default() };
+        let scene = load(&folder, &request).expect("the scene loads");
+        let camera = scene.camera.expect("a camera");
+        Self { accel: Accel::build(&scene, Quality::Medium), lights: light::lights(&scene), camera, scene }
+    }
+
+    fn with_stage<T>(&self, shadow_rays: u32, level: Level, what: impl FnOnce(&Stage<'_>) -> T) -> T {
+        let frame = self.camera.frame();
+        what(&Stage {
+            scene: &self.scene,
+            bvh: self.accel.bvh(),
+            lights: &self.lights,
+            eye: self.camera.eye,
+            camera: &frame,
+            shadow_rays,
+            pattern: Pattern::default(),
+            seed: 7,
+            level,
+            count: false,
+        })
+    }
+
+    /// The picture of each pass by itself.
+    fn passes(&self, method: &dyn Visibility, passes: u32, shadow_rays: u32) -> Vec<Image> {
+        self.with_stage(shadow_rays, detect(), |stage| {
+            let (width, height) = (self.camera.width, self.camera.height);
+            let mut scratch = Scratch::default();
+            let tiles: Vec<_> = Film::new(width, height).tiles().iter().map(|tile| tile.tile()).collect();
+            method.begin(stage, &tiles, width);
+            (0..passes)
+                .map(|pass| {
+                    let mut film = Film::new(width, height);
+                    for tile in film.tiles_mut() {
+                        render_tile(stage, method, width, pass, tile, &mut scratch);
+                    }
+                    method.passed(stage);
+                    film.develop()
+                })
+                .collect()
+        })
+    }
+}
+
+/// Means over blocks of 8 by 8 pixels.
+fn blocks(image: &Image) -> Vec<f64> {
+    let across = image.width.div_ceil(8) as usize;
+    let mut sums = vec![0.0; across * image.height.div_ceil(8) as usize];
+    for (i, pixel) in image.pixels.iter().enumerate() {
+        let (x, y) = (i % image.width as usize, i / image.width as usize);
+        sums[y / 8 * across + x / 8] += f64::from(pixel[0] + pixel[1] + pixel[2]) / 192.0;
+    }
+    sums
+}
+
+/// Holds each pass against the same camera samples with many shadow rays: for every block the mean of the differences over
+/// the passes must lie within its standard errors. Passes depend on earlier ones, but each difference is 0 on average
+/// given those, so their sum is a martingale. Five and a half standard errors for some 150 blocks of Student's t with 31
+/// degrees of freedom: wrong once in 1300 runs if there is no bias; and the sum of squares as well.
+fn assert_unbiased(setting: &Setting, name: &str, method: &dyn Visibility, reference: &[Image]) {
+    let passes = setting.passes(method, reference.len() as u32, 16);
+    let differences: Vec<Vec<f64>> = passes
+        .iter()
+        .zip(reference)
+        .map(|(a, b)| blocks(a).iter().zip(blocks(b)).map(|(a, b)| a - b).collect())
+        .collect();
+    let n = differences.len() as f64;
+    let (mut squares, mut counted) = (0.0, 0.0);
+    for block in 0..differences[0].len() {
+        let mean = differences.iter().map(|pass| pass[block]).sum::<f64>() / n;
+        let variance = differences.iter().map(|pass| (pass[block] - mean).powi(2)).sum::<f64>() / (n - 1.0);
+        if variance < 1e-16 {
+            assert!(mean.abs() < 1e-6, "{name}, block {block}: {mean}");
+            continue;
+        }
+        let z = mean / (variance / n).sqrt();
+        assert!(z.abs() < 5.5, "{name}, block {block}: off by {mean}, z = {z}");
+        squares += z * z;
+        counted += 1.0;
+    }
+    // Of t with 31 degrees of freedom, z² has mean 31/29 and a variance below 3.
+    let limit = counted * 31.0 / 29.0 + 5.0 * (3.0 * counted as f64).sqrt();
+    assert!(squares < limit, "{name}: sum of squares {squares} of {counted} blocks");
+    println!("{name}: {squares:.0} of {counted} blocks");
+}
+
+/// An [`Auto`] whose map somebody tampers with after each pass.
+struct Tampered<F>(Auto, F);
+
+impl<F: Fn(&mut [MapCell], &mut Chances) + Sync> Visibility for Tampered<F> {
+    fn begin(&self, stage: &Stage<'_>, tiles: &[occlude_host::film::Tile], width: u32) {
+        self.0.begin(stage, tiles, width);
+        self.0.alter(&self.1);
+    }
+
+    fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
+        self.0.ask(stage, scratch);
+    }
+
+    fn passed(&self, stage: &Stage<'_>) {
+        self.0.passed(stage);
+        self.0.alter(&self.1);
+    }
+
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &occlude_host::integrator::Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut occlude_kernel::Counts,
+    ) {
+        self.0.estimate(stage, questions, estimates, counts);
+    }
+}
+
+#[test]
+fn pictures_are_right_on_average_whatever_the_map_holds() {
+    const PASSES: u32 = 32;
+    for (scene, size) in [("columns", (128, 72)), ("cornell", (72, 72)), ("fence", (96, 64))] {
+        let setting = Setting::own(scene, size);
+        let reference = setting.passes(&Exact, PASSES, 1024);
+        let check = |what: &str, method: &dyn Visibility| {
+            assert_unbiased(&setting, &format!("{scene}, {what}"), method, &reference);
+        };
+        check("auto", &Auto::new(AutoOptions::default()));
+        let small = AutoOptions { memory: 1 << 17, ..AutoOptions::default() };
+        check("a map with room for few cells", &Auto::new(small));
+        let empty = AutoOptions { memory: 0, ..AutoOptions::default() };
+        check("an empty map", &Auto::new(empty));
+        let large = AutoOptions { cell: 64.0, ..AutoOptions::default() };
+        check("cells as large as half the picture", &Auto::new(large));
+        let least = |cells: &mut [MapCell], chances: &mut Chances| {
+            *chances = Chances::each(1);
+            cells.iter_mut().for_each(|cell| cell.learn(Some(&[0.5; BINS]), chances, 1.0));
+        };
+        check(
+            "u of a half and the least chance everywhere",
+            &Tampered(Auto::new(AutoOptions::default()), least),
+        );
+        let wrong = |cells: &mut [MapCell], chances: &mut Chances| {
+            *chances = Chances::each(3);
+            let mut random = Random::new(cells.len() as u64);
+            for cell in cells {
+                let odds: [f32; BINS] = std::array::from_fn(|_| random.unit());
+                cell.learn(Some(&odds), chances, 1.0);
+            }
+        };
+        check("u at random", &Tampered(Auto::new(AutoOptions::default()), wrong));
+    }
+}
+
+#[test]
+fn threads_and_levels_render_the_same_bits() {
+    let setting = Setting::own("columns", (96, 54));
+    let image = |threads, level| {
+        setting.with_stage(24, level, |stage| {
+            let size = (setting.camera.width, setting.camera.height);
+            let limits = Limits { passes: 5, time: None };
+            let auto = Auto::new(AutoOptions::default());
+            let stop = AtomicBool::new(false);
+            render(stage, &auto, size, limits, threads, &stop, |_| ()).expect("threads").film.develop()
+        })
+    };
+    let first = image(1, detect());
+    for threads in [2, 5] {
+        assert_eq!(first.pixels, image(threads, detect()).pixels, "{threads} threads");
+    }
+    for level in levels().skip(1) {
+        assert_eq!(first.pixels, image(2, level).pixels, "{level:?}");
+    }
+}
+
+#[test]
+fn where_nothing_is_between_every_segment_is_free() {
+    let mut random = Random::new(9);
+    let setting = Setting::own("columns", (32, 18));
+    let bvh = setting.accel.bvh();
+    let (mut empty, mut scratch) = (0, TileScratch::new());
+    for _ in 0..4000 {
+        let mut point = || Vec3::new(random.unit() - 0.5, random.unit(), random.unit() - 0.5);
+        let middle = point() * Vec3::new(20.0, 6.0, 30.0);
+        let (u, v, w) = (point() * 0.4, point() * 0.4, point() * 0.2);
+        let corners: [[f32; 3]; 8] = std::array::from_fn(|i| {
+            let side = |axis: usize| if i >> axis & 1 == 0 { -0.5 } else { 0.5 };
+            (middle + u * side(0) + v * side(1) + w * side(2)).to_array()
+        });
+        let far = middle + (point() - Vec3::splat(0.3)) * 12.0;
+        let ends: Vec<Vec3> = (0..5).map(|_| far + point()).collect();
+        let axis = |k: usize| ends.iter().map(|end| end[k]).collect::<Vec<f32>>();
+        let (x, y, z) = (axis(0), axis(1), axis(2));
+        let targets = Targets::new(&x, &y, &z).expect("as many");
+        if !bvh.nothing_between(&corners, &targets, &mut Uncounted, &mut scratch) {
+            continue;
+        }
+        empty += 1;
+        for _ in 0..50 {
+            let inside = (0..3).fold(middle, |at, k| at + [u, v, w][k] * (random.unit() - 0.5));
+            let weights: Vec<f32> = (0..5).map(|_| random.unit()).collect();
+            let sum: f32 = weights.iter().sum();
+            let end = ends.iter().zip(&weights).fold(Vec3::ZERO, |at, (&end, w)| at + end * (w / sum));
+            assert!(!bvh.occluded(&Ray::segment(inside, end), None, &mut Uncounted));
+        }
+    }
+    assert!(empty > 200, "{empty} of 4000 were empty");
+}
