@@ -69,6 +69,30 @@ impl Accumulator {
         self.deviation += before * (radiance - self.mean);
     }
 
+    /// Becomes the weighted mean of itself and another of the same pixel. Where the other had one sample only, its
+    /// variance is taken from the samples here.
+    fn merge(&mut self, own: f64, other: &Self, weight: f64) {
+        if other.count == 0 {
+            return;
+        }
+        if self.count == 0 {
+            *self = *other;
+            return;
+        }
+        let (a, b) = (own / (own + weight), weight / (own + weight));
+        let its = if other.count < 2 { self.variance_of_sample() } else { other.variance_of_mean() };
+        let variance = a * a * self.variance_of_mean() + b * b * its;
+        self.mean = a * self.mean + b * other.mean;
+        self.count += other.count;
+        let n = f64::from(self.count);
+        self.deviation = variance * n * (n - 1.0);
+    }
+
+    /// Of one sample, as far as is known.
+    fn variance_of_sample(&self) -> DVec3 {
+        self.variance_of_mean() * f64::from(self.count)
+    }
+
     fn variance_of_mean(&self) -> DVec3 {
         if self.count < 2 {
             return DVec3::ZERO;
@@ -136,6 +160,24 @@ impl Film {
             .map(|tile| TileFilm { tile, pixels: vec![Accumulator::default(); tile.len()] })
             .collect();
         Self { width, height, tiles }
+    }
+
+    /// Becomes the mean of itself and another film of the same size and tiles, weighted. Pixels that had nothing in
+    /// one of them are those of the other. Right on average whenever the weights do not depend on what was seen.
+    ///
+    /// # Panics
+    /// If the other has fewer tiles or pixels.
+    pub fn merge(&mut self, own: f64, other: &Film, weight: f64) {
+        for (tile, other) in self.tiles.iter_mut().zip(&other.tiles) {
+            for (pixel, other) in tile.pixels.iter_mut().zip(&other.pixels) {
+                pixel.merge(own, other, weight);
+            }
+        }
+    }
+
+    /// The variance of one sample of each pixel, as far as is known.
+    pub fn variance_of_sample(&self) -> Image {
+        self.image(Accumulator::variance_of_sample)
     }
 
     /// Pixels across.

@@ -7,7 +7,7 @@ use crate::error::{Error, Result};
 use crate::integrator::{
     Auto, AutoOptions, Exact, Form, MapOptions, Rule, Settings, Split, Stage, Stochastic, Visibility, Walled,
 };
-use crate::render::{Limits, render};
+use crate::render::{Limits, render, render_adaptively};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
 use crate::sampler::Pattern;
 use crate::scene::CameraRequest;
@@ -48,6 +48,11 @@ pub struct RenderArgs {
     /// with and without; the map misses fewer blockers with them [default: off for exact, on for map].
     #[arg(long, value_enum, value_name = "SWITCH")]
     volumetric: Option<Switch>,
+
+    /// Whether camera samples go where the picture is not sure yet: --spp is then an average [default: on for --method
+    /// auto].
+    #[arg(long, value_enum)]
+    adaptive: Option<Switch>,
 
     /// How the shadow rays are spread over a light.
     #[arg(long, value_enum, default_value_t)]
@@ -360,8 +365,13 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let stop = super::interruptible("the picture");
     let progress = Progress::new(args.quiet, args.spp, u64::from(size.0) * u64::from(size.1));
     let limits = Limits { passes: args.spp, time: args.time_limit };
-    let rendered =
-        render(&stage, method, size, limits, args.threads.into(), &stop, |pass| progress.passed(pass))?;
+    let passed = |pass| progress.passed(pass);
+    let adaptive = args.adaptive.map_or(args.method == Method::Auto, |switch| switch == Switch::On);
+    let rendered = if adaptive {
+        render_adaptively(&stage, method, size, limits, args.threads.into(), &stop, passed)?
+    } else {
+        render(&stage, method, size, limits, args.threads.into(), &stop, passed)?
+    };
     progress.finish();
 
     let image = rendered.film.develop();

@@ -5,7 +5,7 @@
 //! is rendered against the map as it is. What its rays saw is counted, in whole numbers, so that no order of threads
 //! matters, and between passes the counts become new odds.
 
-use super::{Fan, Questions, Scratch, Share, Stage, Visibility, cast, divide, exact};
+use super::{CameraSample, Fan, Questions, Scratch, Share, Stage, Visibility, cast, divide, exact};
 use crate::film::Tile;
 use crate::light::AreaLight;
 use crate::photons::{BlockerSet, Shower};
@@ -424,11 +424,10 @@ impl Visibility for Auto {
         let strays: Vec<Vec<Stray>> = tiles
             .par_iter()
             .map_init(Scratch::default, |scratch, &tile| {
-                scratch.questions.clear();
-                scratch.samplers.clear();
-                scratch.radiance.clear();
-                scratch.radiance.resize(tile.len(), Vec3::ZERO);
-                cast(&Stage { count: false, ..*stage }, tile, width, 0, scratch);
+                scratch.paths.clear();
+                let all = 0..tile.len() as u32;
+                scratch.paths.extend(all.map(|pixel| CameraSample { pixel, index: 0 }));
+                cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
                     for (light, area) in (0..).zip(stage.lights) {
@@ -461,7 +460,7 @@ impl Visibility for Auto {
         let some = &mut Vec::new();
         for index in 0..questions.points.len() {
             let point = questions.points[index];
-            let sampler = &mut samplers[point.pixel as usize];
+            let sampler = &mut samplers[point.path as usize];
             divide(stage, &point, sampler, shares);
             for &Share { light, unshadowed, count, each } in shares.iter() {
                 let area = &stage.lights[light as usize];
@@ -473,7 +472,7 @@ impl Visibility for Auto {
                 };
                 let full = point.diffuse * area.radiance;
                 if known == Known::Lit {
-                    radiance[point.pixel as usize] += full * (unshadowed * FRAC_1_PI);
+                    radiance[point.path as usize] += full * (unshadowed * FRAC_1_PI);
                     continue;
                 }
                 let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
@@ -528,7 +527,7 @@ impl Visibility for Auto {
                 }
                 questions.odds.resize(questions.weights.len(), None);
                 questions.places.resize(questions.weights.len(), u32::MAX);
-                radiance[point.pixel as usize] += full * sum;
+                radiance[point.path as usize] += full * sum;
                 let last = questions.weights.len() as u32;
                 if last > first {
                     questions.batches.push(super::Batch {

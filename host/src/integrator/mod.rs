@@ -82,6 +82,8 @@ pub trait Visibility: Sync {
 pub struct ShadingPoint {
     /// The pixel, counted row by row in its tile.
     pub pixel: u32,
+    /// Which of the camera samples asked for.
+    path: u32,
     /// The point on the surface.
     pub x: Vec3,
     /// The same moved off the surface, to the side it is seen from: where shadow rays begin.
@@ -160,9 +162,19 @@ impl std::ops::AddAssign for StageTimes {
     }
 }
 
+/// A camera sample: which pixel of a tile, counted row by row, and which of that pixel's samples.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct CameraSample {
+    /// The pixel.
+    pub pixel: u32,
+    /// The sample; those of a pixel are spread the better the fewer are left out.
+    pub index: u32,
+}
+
 /// What a thread keeps from tile to tile, so that nothing is allocated in between.
 #[derive(Clone, Debug, Default)]
 pub struct Scratch {
+    paths: Vec<CameraSample>,
     samplers: Vec<Sampler>,
     radiance: Vec<Vec3>,
     questions: Questions,
@@ -187,14 +199,34 @@ pub fn render_tile(
     film: &mut TileFilm,
     scratch: &mut Scratch,
 ) {
+    scratch.paths.clear();
+    scratch.paths.extend((0..film.tile().len() as u32).map(|pixel| CameraSample { pixel, index: pass }));
+    render_paths(stage, method, width, film, scratch);
+}
+
+/// The same of any camera samples of a tile.
+pub fn render_samples(
+    stage: &Stage<'_>,
+    method: &dyn Visibility,
+    width: u32,
+    samples: impl IntoIterator<Item = CameraSample>,
+    film: &mut TileFilm,
+    scratch: &mut Scratch,
+) {
+    scratch.paths.clear();
+    scratch.paths.extend(samples);
+    render_paths(stage, method, width, film, scratch);
+}
+
+fn render_paths(
+    stage: &Stage<'_>,
+    method: &dyn Visibility,
+    width: u32,
+    film: &mut TileFilm,
+    scratch: &mut Scratch,
+) {
     let start = Instant::now();
-    let tile = film.tile();
-    scratch.questions.clear();
-    scratch.questions.width = tile.width;
-    scratch.samplers.clear();
-    scratch.radiance.clear();
-    scratch.radiance.resize(tile.len(), Vec3::ZERO);
-    cast(stage, tile, width, pass, scratch);
+    cast(stage, film.tile(), width, scratch);
     let cast_end = Instant::now();
     method.ask(stage, scratch);
     let light_end = Instant::now();
@@ -211,9 +243,9 @@ pub fn render_tile(
 
 /// What one pass over a tile asks: for benchmarks and tests of visibility alone.
 pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
-    let mut scratch = Scratch { radiance: vec![Vec3::ZERO; tile.len()], ..Scratch::default() };
-    scratch.questions.width = tile.width;
-    cast(stage, tile, width, pass, &mut scratch);
+    let mut scratch = Scratch::default();
+    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: pass }));
+    cast(stage, tile, width, &mut scratch);
     sample_lights(stage, &mut scratch);
     scratch.questions
 }
@@ -235,17 +267,24 @@ impl<C: Counter> Task for Cast<'_, C> {
     }
 }
 
-fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scratch) {
+/// Casts the camera rays of all paths, and starts everything else anew.
+fn cast(stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) {
+    scratch.questions.clear();
+    scratch.questions.width = tile.width;
+    scratch.samplers.clear();
+    scratch.radiance.clear();
+    scratch.radiance.resize(scratch.paths.len(), Vec3::ZERO);
     let mut rays = RayPacket::default();
-    for first in (0..tile.len()).step_by(RayPacket::WIDTH) {
-        let count = RayPacket::WIDTH.min(tile.len() - first);
+    for first in (0..scratch.paths.len()).step_by(RayPacket::WIDTH) {
+        let count = RayPacket::WIDTH.min(scratch.paths.len() - first);
         for lane in 0..count {
-            let (x, y) = tile.position(first + lane);
+            let CameraSample { pixel, index } = scratch.paths[first + lane];
+            let (x, y) = tile.position(pixel as usize);
             let pixel = u64::from(y) * u64::from(width) + u64::from(x);
-            let at = Sampler::in_pixel(stage.seed, pixel, pass);
+            let at = Sampler::in_pixel(stage.seed, pixel, index);
             let (px, py) = (x as f32 + at[0], y as f32 + at[1]);
             rays.set(lane, &occlude_kernel::Ray::from(stage.eye, stage.camera.ray_direction(px, py)));
-            scratch.samplers.push(Sampler::new(stage.seed, pixel, pass));
+            scratch.samplers.push(Sampler::new(stage.seed, pixel, index));
         }
         let (bvh, rays, active) = (stage.bvh, &rays, (1u32 << count) - 1);
         let hits = if stage.count {
@@ -271,7 +310,8 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32, scratch: &mut Scra
             let normal = if front { geometric } else { -geometric };
             let x = a * (1.0 - hit.u - hit.v) + b * hit.u + c * hit.v;
             scratch.questions.points.push(ShadingPoint {
-                pixel: (first + lane) as u32,
+                pixel: scratch.paths[first + lane].pixel,
+                path: (first + lane) as u32,
                 x,
                 origin: offset(x, normal, stage.bvh.clearance()),
                 normal,
@@ -430,7 +470,7 @@ fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
     let Scratch { samplers, questions, shares, square, fan, .. } = scratch;
     for index in 0..questions.points.len() {
         let point = questions.points[index];
-        let sampler = &mut samplers[point.pixel as usize];
+        let sampler = &mut samplers[point.path as usize];
         divide(stage, &point, sampler, shares);
         for &Share { light, count, each, .. } in shares.iter().filter(|share| share.count > 0) {
             let first = questions.weights.len() as u32;
@@ -448,16 +488,16 @@ fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
 }
 
 fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
-    let Scratch { questions, estimates, radiance, .. } = scratch;
+    let Scratch { questions, estimates, radiance, paths, .. } = scratch;
     for batch in &questions.batches {
         let samples = batch.samples.start as usize..batch.samples.end as usize;
         let arrives: f32 =
             questions.weights[samples.clone()].iter().zip(&estimates[samples]).map(|(w, v)| w * v).sum();
         let point = &questions.points[batch.point as usize];
-        radiance[point.pixel as usize] +=
+        radiance[point.path as usize] +=
             point.diffuse * stage.lights[batch.light as usize].radiance * arrives;
     }
-    for (pixel, &radiance) in radiance.iter().enumerate() {
-        film.add(pixel, radiance);
+    for (path, &radiance) in paths.iter().zip(radiance.iter()) {
+        film.add(path.pixel as usize, radiance);
     }
 }
