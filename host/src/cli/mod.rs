@@ -1,6 +1,7 @@
 //! The command `occlude`.
 
 pub mod compare;
+mod compare_methods;
 pub mod generate;
 pub mod info;
 pub mod map;
@@ -36,6 +37,8 @@ enum Command {
     Info(info::InfoArgs),
     /// Compare two images: error, bias, FLIP.
     Compare(compare::CompareArgs),
+    /// Run methods side by side on a scene, and write a page of their errors and times.
+    CompareMethods(compare_methods::CompareMethodsArgs),
     /// Show the photons of the occlusion map, and what they say.
     Photons(photons::PhotonsArgs),
     /// Write a scene of any size.
@@ -72,6 +75,7 @@ pub fn run() -> ExitCode {
         Command::Render(args) => render::run(args, level),
         Command::Info(args) => info::run(args, level).map(|()| Ended::Done),
         Command::Compare(args) => compare::run(args).map(|()| Ended::Done),
+        Command::CompareMethods(args) => compare_methods::run(args, level),
         Command::Photons(args) => photons::run(args, level).map(|()| Ended::Done),
         Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
         Command::Reproduce(args) => reproduce::run(args, level),

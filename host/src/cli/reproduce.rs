@@ -4,7 +4,7 @@ use super::{Ended, note};
 use crate::error::Result;
 use crate::page::{Folder, INDEX};
 use crate::reproduce::theory::{self, theory};
-use crate::reproduce::{Halted, Run, Watch};
+use crate::reproduce::{Halted, Reproduced, Run, Watch};
 use clap::{Args, Subcommand};
 use indicatif::{ProgressBar, ProgressStyle};
 use occlude_kernel::lanes::Level;
@@ -69,12 +69,22 @@ pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
         stop: &stop,
         watch: &progress,
     };
-    let reproduced = match theory(&run) {
+    write(&folder, theory(&run), &progress, args.quiet)
+}
+
+/// Writes a page and what goes beside it.
+pub(super) fn write(
+    folder: &Folder,
+    reproduced: std::result::Result<Reproduced, Halted>,
+    progress: &Progress,
+    quiet: bool,
+) -> Result<Ended> {
+    let reproduced = match reproduced {
         Ok(reproduced) => reproduced,
         Err(Halted::Failed(error)) => return Err(error),
         Err(Halted::Interrupted) => {
             progress.finish();
-            if !args.quiet {
+            if !quiet {
                 note("interrupted; nothing was written");
             }
             return Ok(Ended::Interrupted);
@@ -85,14 +95,14 @@ pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
         folder.write(name, &data.csv())?;
     }
     folder.write(INDEX, reproduced.page.html(&reproduced.foot).as_bytes())?;
-    if !args.quiet {
+    if !quiet {
         note(&format!("wrote {} and {} files of data", folder.file(INDEX).display(), reproduced.data.len()));
     }
     Ok(Ended::Done)
 }
 
 /// A bar on a terminal, a line a step in a pipe.
-enum Progress {
+pub(super) enum Progress {
     Quiet,
     Bar(ProgressBar),
     Lines { start: Instant, last: Mutex<String> },
@@ -102,7 +112,7 @@ enum Progress {
 const STEPS: f64 = 1000.0;
 
 impl Progress {
-    fn new(quiet: bool) -> Self {
+    pub(super) fn new(quiet: bool) -> Self {
         if quiet {
             return Self::Quiet;
         }
