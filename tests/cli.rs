@@ -203,6 +203,12 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["reproduce", "theory", "-o", &cornell], "--force"),
         (&["reproduce", "theory", "--threads", "99999999"], "threads"),
         (&["reproduce", "theory", "--threads", "9999"], "1024"),
+        (&["compare-methods", &cornell, "--methods", "magic"], "magic"),
+        (&["compare-methods", &cornell, "--methods", "auto,exact,auto"], "twice"),
+        (&["compare-methods", &cornell, "-o", &cornell], "--force"),
+        (&["compare-methods", "nowhere"], "nowhere"),
+        (&["render", &cornell, "--adaptive", "perhaps"], "perhaps"),
+        (&["render", &cornell, "--method", "auto", "--volumetric", "on"], "--volumetric"),
         (&["frobnicate"], "frobnicate"),
     ];
     for (args, cause) in cases {
@@ -256,6 +262,76 @@ fn interrupting_keeps_what_there_is() {
 fn rows(file: &Path) -> Vec<std::collections::HashMap<String, String>> {
     let mut reader = csv::Reader::from_path(file).expect("a file of data");
     reader.deserialize().map(|row| row.expect("as many cells as columns")).collect()
+}
+
+#[test]
+fn the_map_that_learns_renders_and_is_compared() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let done = |args: &[&str]| {
+        let done = occlude(args, folder.path());
+        assert_eq!(done.status.code(), Some(0), "{args:?}: {}", text(&done.stderr));
+    };
+    let columns = scene("columns");
+    let common = ["render", columns.as_str(), "--size", "64x36", "--spp", "9", "-q"];
+    for (name, options) in [
+        ("auto.exr", &["--method", "auto", "--threads", "1"][..]),
+        ("again.exr", &["--method", "auto", "--threads", "3"]),
+        ("plain.exr", &["--method", "auto", "--adaptive", "off"]),
+        ("exact.exr", &["--method", "exact", "--adaptive", "on"]),
+    ] {
+        done(&[&common[..], &["-o", name], options].concat());
+    }
+    let read = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
+    assert!(read("auto.exr") == read("again.exr"), "the same for any number of threads");
+    assert!(read("auto.exr") != read("plain.exr"));
+
+    done(&[
+        "compare-methods",
+        &columns,
+        "--size",
+        "64x36",
+        "--spp",
+        "3",
+        "--shadow-rays",
+        "12",
+        "--reference-rays",
+        "64",
+        "-o",
+        "page",
+    ]);
+    let page = folder.path().join("page");
+    let found = rows(&page.join("methods.csv"));
+    assert_eq!(
+        found.iter().map(|row| row["method"].as_str()).collect::<Vec<_>>(),
+        ["exact", "auto", "stochastic", "map"]
+    );
+    for row in &found {
+        assert!(row["rmse"].parse::<f64>().expect("a number") > 0.0);
+        assert!(row["gain_visibility"].parse::<f64>().expect("a number") > 0.0);
+    }
+    assert_eq!(rows(&page.join("passes.csv")).len(), 4 * 3, "after 1, 2 and 3 passes");
+    let html = String::from_utf8(std::fs::read(page.join("index.html")).expect("the page")).expect("text");
+    roxmltree::Document::parse_with_options(
+        &html,
+        roxmltree::ParsingOptions { allow_dtd: true, ..Default::default() },
+    )
+    .expect("well formed");
+    // A page of its own is replaced.
+    done(&[
+        "compare-methods",
+        &columns,
+        "--size",
+        "32x18",
+        "--spp",
+        "1",
+        "--methods",
+        "exact,auto",
+        "--reference-rays",
+        "16",
+        "-o",
+        "page",
+        "-q",
+    ]);
 }
 
 #[test]
