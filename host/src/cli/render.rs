@@ -5,8 +5,8 @@ use super::{Ended, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, Form, MapOptions, PreparedMap, Rule, Settings, Split, Stage, Stochastic,
-    Visibility,
+    Auto, AutoOptions, Exact, Form, MapOptions, MapTerms, PreparedMap, Rule, Settings, Split, Stage,
+    Stochastic, Visibility,
 };
 use crate::render::{Limits, render};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
@@ -203,25 +203,29 @@ enum Method {
 enum Chosen {
     Exact,
     Stochastic(Settings),
+    MapTerms(Settings, MapOptions),
     Map(MapOptions),
     Auto(AutoOptions),
 }
 
 impl Chosen {
     fn from(args: &RenderArgs) -> Result<Self> {
-        let foreign = [
-            (Method::Stochastic, args.stochastic.given(), "stochastic"),
-            (Method::Map, args.map.given(), "map"),
-        ];
-        for (method, given, name) in foreign {
-            if let (true, Some(option)) = (args.method != method, given) {
-                return Err(Error::Usage(format!("{option} is an option of --method {name}")));
-            }
+        if let (true, Some(option)) = (args.method != Method::Stochastic, args.stochastic.given()) {
+            return Err(Error::Usage(format!("{option} is an option of --method stochastic")));
+        }
+        let (mapped, blockers) = (args.map.given(), args.map.names_blockers().then_some("--blockers"));
+        if let (Method::Exact | Method::Auto, Some(option)) = (args.method, mapped.or(blockers)) {
+            return Err(Error::Usage(format!(
+                "{option} is an option of --method map, or of --method stochastic with --blockers map"
+            )));
         }
         Ok(match args.method {
             Method::Exact => Self::Exact,
-            Method::Stochastic => Self::Stochastic(args.stochastic.settings()?),
-            Method::Map => Self::Map(args.map.options(args.quality)),
+            Method::Stochastic => match args.map.below_stochastic(args.quality)? {
+                None => Self::Stochastic(args.stochastic.settings()?),
+                Some(options) => Self::MapTerms(MapTerms::checked(args.stochastic.settings()?)?, options),
+            },
+            Method::Map => Self::Map(args.map.options(args.quality)?),
             Method::Auto => Self::Auto(AutoOptions::default()),
         })
     }
@@ -230,6 +234,7 @@ impl Chosen {
         match self {
             Self::Exact => "exact".to_owned(),
             Self::Stochastic(settings) => format!("stochastic {settings}"),
+            Self::MapTerms(settings, _) => format!("map + stochastic {settings}"),
             Self::Map(_) => "map".to_owned(),
             Self::Auto(_) => "auto".to_owned(),
         }
@@ -321,13 +326,23 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         Chosen::Exact => {}
         Chosen::Stochastic(settings) => stochastic = Some(Stochastic::new(*settings, &scene, &stage.bvh)?),
         Chosen::Auto(options) => auto = Some(Auto::new(*options)),
-        Chosen::Map(options) => prepared = Some(map::prepare(&stage, options, args.threads.into())?),
+        Chosen::MapTerms(_, options) | Chosen::Map(options) => {
+            prepared = Some(map::prepare(&stage, options, args.threads.into())?)
+        }
     }
-    let map = prepared.as_ref().map(PreparedMap::visibility);
-    let method: &dyn Visibility = match (&stochastic, &map, &auto) {
+    let mut map = prepared.as_ref().map(PreparedMap::visibility);
+    let terms = match (&chosen, &mut map) {
+        (Chosen::MapTerms(settings, _), map) => {
+            map.take().map(|map| MapTerms::new(map, *settings, &scene)).transpose()?
+        }
+        _ => None,
+    };
+    let map = terms.as_ref().map(MapTerms::map).or(map.as_ref());
+    let method: &dyn Visibility = match (&stochastic, &terms, map, &auto) {
         (Some(stochastic), ..) => stochastic,
-        (_, Some(map), _) => map,
-        (_, _, Some(auto)) => auto,
+        (_, Some(terms), ..) => terms,
+        (_, _, Some(map), _) => map,
+        (.., Some(auto)) => auto,
         _ => &Exact,
     };
     let preprocess = start.elapsed();
@@ -382,7 +397,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
             bvh_bytes_per_triangle: accel.bytes() as f64 / accel.triangles().max(1) as f64,
             triangles: accel.triangles(),
         },
-        map: prepared.as_ref().zip(map.as_ref()).map(|(prepared, map)| prepared.figures(map)),
+        map: prepared.as_ref().zip(map).map(|(prepared, map)| prepared.figures(map)),
         error,
     };
     if let Some(path) = &args.stats {
