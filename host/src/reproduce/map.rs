@@ -678,14 +678,14 @@ pub fn map(run: &Run<'_>, folder: Option<&Path>) -> Result<Reproduced, Halted> {
     ));
     page.add(&signs);
     page.prose(
-        "Where the signs differ from the thesis’. Plain: a shadow ray in our map stops at the first block of \
-         eight triangles that hits it, and all rays of a point and light are asked in one go. A term that \
-         needs one half saves the other half’s tests only for rays that nothing blocks early. Optimised: the \
-         64 test rays ask both halves for every point and light of the penumbra; beside as few \
-         samples as here they weigh more than the samples themselves, which is the larger part of the growth. \
-         The thesis took more light samples a point, and built a tree over each half, which we do not. \
-         In both variants one random term of a sum has a variance that exact rays do not have, so the error \
-         grows where the thesis compares time and tests alone.",
+        "Tests and time can part: all rays of a point and light are asked of eight triangles at once, and a term \
+         that wants one half only saves lanes, while choosing it costs time of its own; where the sign of plain \
+         time is not the thesis’, this is why, or the noise of a time of milliseconds. Tests of the optimised variant \
+         grow by more than in the thesis: the 64 test rays ask both halves for every point and light of a \
+         penumbra, and beside as few samples as here they outweigh the samples themselves (compare *plain + \
+         trees*, which asks no test rays). No tree is built over the halves, as the thesis does: the trees are \
+         parts of the scene’s own. And the column that the thesis’ table does not have: one random term of a \
+         sum has a variance that exact rays do not have, so at an equal number of rays the error grows.",
     );
     page.add(&strip);
     page.add(&results);
@@ -698,7 +698,9 @@ pub fn map(run: &Run<'_>, folder: Option<&Path>) -> Result<Reproduced, Halted> {
          it, since few points have the worst V. Where it is above, the photons are not those of the point: \
          they were found on a disc around it, and thin shadows are narrower than the disc. A wrong call is \
          one where at least one of the rays says otherwise, whatever it is worth. Rays are 64 a light on average; \
-         points and lights are those of one pass over the picture.",
+         points and lights are those of one pass over the picture. Few photons make few wrong calls, since \
+         k of them then lie far apart, and almost every point counts as penumbra: it is missed blockers that \
+         they cost, see below.",
     );
     page.add(&wrong);
     page.data("calls.csv", "the numbers of this table");
