@@ -348,54 +348,6 @@ fn an_interrupted_reproduction_leaves_nothing() {
 }
 
 #[test]
-fn maps_render_and_are_shown() {
-    let folder = tempfile::tempdir().expect("a folder");
-    let plates = scene("plates");
-    let common = ["--size", "32x24", "--photons", "5000", "--quiet"];
-    let small = ["--spp", "1", "--shadow-rays", "8", "-o", "a.pfm", "--stats", "s.json"];
-    let ways: [(&[&str], &str); 5] = [
-        (&["--method", "map"], "map"),
-        (&["--method", "map", "--blockers", "triangle"], "map"),
-        (&["--method", "map", "--blocker-kind", "object"], "map"),
-        (&["--method", "stochastic", "--blockers", "map"], "map + stochastic balanced uniform random"),
-        (
-            &[
-                "--method",
-                "stochastic",
-                "--blockers",
-                "map",
-                "--blocker-kind",
-                "triangle",
-                "--split",
-                "sorted",
-                "--probabilities",
-                "optimal",
-                "--decomposition",
-                "residual",
-                "--quotas",
-            ],
-            "map + stochastic residual optimal sorted quotas",
-        ),
-    ];
-    for (way, name) in ways {
-        let args = [&["render", &plates][..], &common, &small, way].concat();
-        let done = occlude(&args, folder.path());
-        assert_eq!(done.status.code(), Some(0), "{way:?}: {}", text(&done.stderr));
-        let json = std::fs::read_to_string(folder.path().join("s.json")).expect("statistics");
-        let stats: serde_json::Value = serde_json::from_str(&json).expect("JSON");
-        assert_eq!(stats["method"], name);
-        assert_eq!(stats["map"]["lines"], 5000);
-        assert!(stats["map"]["penumbra"].as_u64() > Some(0), "{json}");
-    }
-    for file in ["m.png", "m.ply"] {
-        let args = [&["photons", &plates, "-o", file][..], &common].concat();
-        let done = occlude(&args, folder.path());
-        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
-        assert!(folder.path().join(file).metadata().expect(file).len() > 100);
-    }
-}
-
-#[test]
 fn the_map_is_reproduced() {
     let folder = tempfile::tempdir().expect("a folder");
     let done = occlude(&["reproduce", "map", "--quick", "-o", "page"], folder.path());
