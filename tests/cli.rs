@@ -201,6 +201,25 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["generate", "marble"], "marble"),
         (&["reproduce", "magic"], "magic"),
         (&["reproduce", "theory", "-o", &cornell], "--force"),
+        (&["reproduce", "map", "-o", &cornell], "--force"),
+        (&["render", &cornell, "--photons", "9"], "--blockers map"),
+        (&["render", &cornell, "--blockers", "map"], "--method stochastic"),
+        (&["render", &cornell, "--method", "stochastic", "--photon-k", "9"], "--blockers map"),
+        (
+            &["render", &cornell, "--method", "stochastic", "--blockers", "triangle"],
+            "--blocker-kind triangle",
+        ),
+        (&["render", &cornell, "--method", "map", "--blockers", "all"], "--blocker-kind"),
+        (&["render", &cornell, "--method", "map", "--blockers", "house"], "treelet:SIZE"),
+        (&["render", &cornell, "--method", "map", "--blocker-kind", "treelet:1"], "treelet:128"),
+        (
+            &["render", &cornell, "--method", "map", "--blockers", "object", "--blocker-kind", "object"],
+            "--blocker-kind alone",
+        ),
+        (
+            &["render", &cornell, "--method", "stochastic", "--blockers", "map", "--split", "object"],
+            "random or sorted",
+        ),
         (&["reproduce", "theory", "--threads", "99999999"], "threads"),
         (&["reproduce", "theory", "--threads", "9999"], "1024"),
         (&["compare-methods", &cornell, "--methods", "magic"], "magic"),
@@ -426,4 +445,75 @@ fn an_interrupted_reproduction_leaves_nothing() {
     assert_eq!(done.status.code(), Some(1), "{said}");
     assert!(said.contains("nothing was written"), "{said}");
     assert!(!folder.path().join("a").exists());
+}
+
+#[test]
+fn maps_render_and_are_shown() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let plates = scene("plates");
+    let common = ["--size", "32x24", "--photons", "5000"];
+    let small = ["--spp", "1", "--shadow-rays", "8", "--quiet", "-o", "a.pfm", "--stats", "s.json"];
+    let ways: [(&[&str], &str); 5] = [
+        (&["--method", "map"], "map"),
+        (&["--method", "map", "--blockers", "triangle"], "map"),
+        (&["--method", "map", "--blocker-kind", "object"], "map"),
+        (&["--method", "stochastic", "--blockers", "map"], "map + stochastic balanced uniform random"),
+        (
+            &[
+                "--method",
+                "stochastic",
+                "--blockers",
+                "map",
+                "--blocker-kind",
+                "triangle",
+                "--split",
+                "sorted",
+                "--probabilities",
+                "optimal",
+                "--decomposition",
+                "residual",
+                "--quotas",
+            ],
+            "map + stochastic residual optimal sorted quotas",
+        ),
+    ];
+    for (way, name) in ways {
+        let args = [&["render", &plates][..], &common, &small, way].concat();
+        let done = occlude(&args, folder.path());
+        assert_eq!(done.status.code(), Some(0), "{way:?}: {}", text(&done.stderr));
+        let json = std::fs::read_to_string(folder.path().join("s.json")).expect("statistics");
+        let stats: serde_json::Value = serde_json::from_str(&json).expect("JSON");
+        assert_eq!(stats["method"], name);
+        assert_eq!(stats["map"]["lines"], 5000);
+        assert!(stats["map"]["penumbra"].as_u64() > Some(0), "{json}");
+    }
+    for file in ["m.png", "m.ply"] {
+        let args = [&["photons", &plates, "-o", file][..], &common].concat();
+        let done = occlude(&args, folder.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+        assert!(folder.path().join(file).metadata().expect(file).len() > 100);
+    }
+}
+
+#[test]
+fn the_map_is_reproduced() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let done = occlude(&["reproduce", "map", "--quick", "-o", "page"], folder.path());
+    assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+    let page = folder.path().join("page");
+    let html = std::fs::read_to_string(page.join("index.html")).expect("a page");
+    assert!(html.contains("left out"), "says which scenes are not there");
+    let results = rows(&page.join("map.csv"));
+    assert_eq!(results.len(), 4 * 9);
+    for row in &results {
+        assert!(row["rmse"].parse::<f64>().expect("a number") > 0.0, "{row:?}");
+    }
+    let calls = rows(&page.join("calls.csv"));
+    assert_eq!(calls.len(), 4 * 4);
+    for row in &calls {
+        let number = |column: &str| row[column].parse::<u64>().expect("a number");
+        let parts = ["lit", "dark", "penumbra", "unknown"].map(number);
+        assert_eq!(parts.iter().sum::<u64>(), number("points_and_lights"), "{row:?}");
+    }
+    assert!(rows(&page.join("photons.csv")).len() >= 4 * 3);
 }

@@ -8,9 +8,11 @@ use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::generate::{Kind, generate};
 use occlude_host::integrator::{
-    Exact, Form, Questions, Rule, Settings, Split, Stage, Stochastic, Visibility,
+    Exact, Form, Map, MapOptions, MapTerms, PreparedMap, Questions, Rule, Settings, Split, Stage, Stochastic,
+    Visibility,
 };
 use occlude_host::light::{AreaLight, lights};
+use occlude_host::photons::BlockerKind;
 use occlude_host::render::{Limits, Rendered, render};
 use occlude_host::sampler::Pattern;
 use occlude_host::scene::{CameraRequest, Scene, load};
@@ -283,4 +285,71 @@ fn settings_that_do_not_go_together_are_refused() {
     let object = Settings { split: Split::Object, ..balanced };
     let said = Stochastic::new(object, &scene, &accel.bvh()).expect_err("refused").to_string();
     assert!(said.contains("objects"), "{said}");
+}
+
+/// Random terms over what photons name, less exact rays against the same.
+struct Terms<'a>(MapTerms<'a>, Map<'a>);
+
+impl Visibility for Terms<'_> {
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        let mut known = Vec::new();
+        self.1.estimate(stage, questions, &mut known, counts);
+        self.0.estimate(stage, questions, estimates, counts);
+        assert_eq!(estimates.len(), known.len());
+        estimates.iter_mut().zip(&known).for_each(|(x, v)| *x -= v);
+    }
+}
+
+/// Every form, split, rule and kind of blockers: the expectation is that of the map, to within five standard errors of
+/// every block of pixels.
+#[test]
+fn terms_over_a_map_have_its_expectation() {
+    let setting = Setting::own("plates", (48, 32));
+    let spheres = Setting::of(generate(Kind::Spheres, 1, 2000), (48, 32));
+    let kinds = [BlockerKind::Triangle, BlockerKind::Treelet(16), BlockerKind::Object];
+    for setting in [&setting, &spheres] {
+        for (f, form) in FORMS.into_iter().enumerate() {
+            for (s, split) in [Split::Random, Split::Sorted].into_iter().enumerate() {
+                let i = 2 * f + s;
+                let (rule, quotas) = turn(form, i + f);
+                let settings = Settings { form, rule, split, groups: 2, quotas };
+                let camera = setting.scene.camera.expect("a camera");
+                let frame = camera.frame();
+                let stage = Stage {
+                    scene: &setting.scene,
+                    bvh: setting.accel.bvh(),
+                    lights: &setting.lights,
+                    eye: camera.eye,
+                    camera: &frame,
+                    shadow_rays: SHADOW_RAYS,
+                    pattern: Pattern::default(),
+                    seed: 3,
+                    level: detect(),
+                    count: false,
+                };
+                let options = MapOptions {
+                    lines: Some(20_000),
+                    k: 50,
+                    radius: None,
+                    // Few names leave a half empty, and learned terms without noise to test.
+                    blockers: if rule == Rule::Optimal { BlockerKind::Triangle } else { kinds[i % 3] },
+                    quality: Quality::Medium,
+                };
+                let map = PreparedMap::new(&stage, &options);
+                let terms =
+                    MapTerms::new(map.visibility(), settings, &setting.scene).expect("they go together");
+                let difference = setting.render(&Terms(terms, map.visibility()), 32, 0, 0);
+                let learned = form == Form::Residual && rule == Rule::Optimal;
+                let (off, told) = worst(setting, &difference, learned);
+                println!("{}, {settings}, {}: {told}", setting.scene.name, options.blockers);
+                assert!(off < 5.0, "{}, {settings}, {}: {told}", setting.scene.name, options.blockers);
+            }
+        }
+    }
 }

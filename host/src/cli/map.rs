@@ -11,7 +11,7 @@ use clap::Args;
 
 /// The occlusion map's options.
 #[derive(Debug, Args)]
-#[command(next_help_heading = "Occlusion map (--method map)")]
+#[command(next_help_heading = "Occlusion map (--method map, or stochastic --blockers map)")]
 pub struct MapArgs {
     /// Photons to shoot: lines from the lights [default: four a triangle, 250 000 to 4 000 000].
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
@@ -28,7 +28,35 @@ pub struct MapArgs {
     /// What a photon names when something is in its way: triangle, object (of the file), or treelet:SIZE (a
     /// subtree of the scene's tree with at most SIZE triangles) [default: treelet:128].
     #[arg(long, value_name = "KIND")]
-    blockers: Option<BlockerKind>,
+    blocker_kind: Option<BlockerKind>,
+
+    /// Of --method stochastic, what is in the groups: all of the scene (the default), or what the photons of a map
+    /// name. With --method map, short for --blocker-kind.
+    #[arg(long, value_name = "all|map|KIND")]
+    blockers: Option<Asked>,
+}
+
+/// Which blockers, or of what kind.
+#[derive(Clone, Copy, Debug)]
+enum Asked {
+    All,
+    Map,
+    Kind(BlockerKind),
+}
+
+impl std::str::FromStr for Asked {
+    type Err = String;
+
+    fn from_str(text: &str) -> std::result::Result<Self, String> {
+        match text {
+            "all" => Ok(Self::All),
+            "map" => Ok(Self::Map),
+            kind => kind
+                .parse()
+                .map(Self::Kind)
+                .map_err(|error: String| format!("wants all, map, or a kind: {error}")),
+        }
+    }
 }
 
 fn radius(text: &str) -> std::result::Result<f32, String> {
@@ -43,18 +71,57 @@ impl MapArgs {
             (self.photons.is_some(), "--photons"),
             (self.photon_k.is_some(), "--photon-k"),
             (self.photon_radius.is_some(), "--photon-radius"),
-            (self.blockers.is_some(), "--blockers"),
+            (self.blocker_kind.is_some(), "--blocker-kind"),
         ];
         given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
     }
 
+    /// Whether `--blockers` was given.
+    pub fn names_blockers(&self) -> bool {
+        self.blockers.is_some()
+    }
+
     /// What they ask for.
-    pub fn options(&self, quality: Quality) -> MapOptions {
+    pub fn options(&self, quality: Quality) -> Result<MapOptions> {
+        let kind = match (self.blockers, self.blocker_kind) {
+            (Some(Asked::All), _) => {
+                return Err(Error::Usage(
+                    "--blockers all is for --method stochastic: a map asks what its photons name; give a kind, \
+                     like --blocker-kind treelet:128"
+                        .into(),
+                ));
+            }
+            (Some(Asked::Kind(_)), Some(_)) => {
+                return Err(Error::Usage(
+                    "--blockers and --blocker-kind both name a kind: give --blocker-kind alone".into(),
+                ));
+            }
+            (Some(Asked::Kind(kind)), None) => Some(kind),
+            (_, kind) => kind,
+        };
+        Ok(self.of_kind(kind, quality))
+    }
+
+    /// The map that `--method stochastic` is to ask, if any.
+    pub fn below_stochastic(&self, quality: Quality) -> Result<Option<MapOptions>> {
+        match (self.blockers, self.given()) {
+            (Some(Asked::Map), _) => Ok(Some(self.of_kind(self.blocker_kind, quality))),
+            (Some(Asked::Kind(kind)), _) => Err(Error::Usage(format!(
+                "--blockers is all or map with --method stochastic: give --blockers map --blocker-kind {kind}"
+            ))),
+            (_, Some(option)) => Err(Error::Usage(format!(
+                "{option} is an option of --method map, or of --method stochastic with --blockers map"
+            ))),
+            (_, None) => Ok(None),
+        }
+    }
+
+    fn of_kind(&self, kind: Option<BlockerKind>, quality: Quality) -> MapOptions {
         MapOptions {
             lines: self.photons,
             k: self.photon_k.unwrap_or(50) as usize,
             radius: self.photon_radius,
-            blockers: self.blockers.unwrap_or_default(),
+            blockers: kind.unwrap_or_default(),
             quality,
         }
     }

@@ -96,7 +96,7 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
         level,
         count: false,
     };
-    let prepared = map::prepare(&stage, &args.map.options(args.quality), args.threads.into())?;
+    let prepared = map::prepare(&stage, &args.map.options(args.quality)?, args.threads.into())?;
     let store = &prepared.store;
     note(&format!(
         "{} lines: {} light and {} occlusion photons, shot in {:.3} s, sorted in {:.3} s",

@@ -5,7 +5,8 @@ use super::{Ended, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, Form, MapOptions, Rule, Settings, Split, Stage, Stochastic, Visibility, Walled,
+    Auto, AutoOptions, Exact, Form, MapOptions, MapTerms, Rule, Settings, Split, Stage, Stochastic,
+    Visibility, Walled,
 };
 use crate::render::{Limits, render, render_adaptively};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
@@ -222,28 +223,32 @@ enum Switch {
 enum Chosen {
     Exact,
     Stochastic(Settings),
+    MapTerms(Settings, MapOptions),
     Map(MapOptions),
     Auto(AutoOptions),
 }
 
 impl Chosen {
     fn from(args: &RenderArgs) -> Result<Self> {
-        let foreign = [
-            (Method::Stochastic, args.stochastic.given(), "stochastic"),
-            (Method::Map, args.map.given(), "map"),
-        ];
-        for (method, given, name) in foreign {
-            if let (true, Some(option)) = (args.method != method, given) {
-                return Err(Error::Usage(format!("{option} is an option of --method {name}")));
-            }
+        if let (true, Some(option)) = (args.method != Method::Stochastic, args.stochastic.given()) {
+            return Err(Error::Usage(format!("{option} is an option of --method stochastic")));
+        }
+        let (mapped, blockers) = (args.map.given(), args.map.names_blockers().then_some("--blockers"));
+        if let (Method::Exact | Method::Auto, Some(option)) = (args.method, mapped.or(blockers)) {
+            return Err(Error::Usage(format!(
+                "{option} is an option of --method map, or of --method stochastic with --blockers map"
+            )));
         }
         if matches!(args.method, Method::Stochastic | Method::Auto) && args.volumetric.is_some() {
             return Err(Error::Usage("--volumetric is an option of --method exact and map".to_owned()));
         }
         Ok(match args.method {
             Method::Exact => Self::Exact,
-            Method::Stochastic => Self::Stochastic(args.stochastic.settings()?),
-            Method::Map => Self::Map(args.map.options(args.quality)),
+            Method::Stochastic => match args.map.below_stochastic(args.quality)? {
+                None => Self::Stochastic(args.stochastic.settings()?),
+                Some(options) => Self::MapTerms(MapTerms::checked(args.stochastic.settings()?)?, options),
+            },
+            Method::Map => Self::Map(args.map.options(args.quality)?),
             Method::Auto => Self::Auto(AutoOptions::default()),
         })
     }
@@ -252,6 +257,7 @@ impl Chosen {
         match self {
             Self::Exact => "exact".to_owned(),
             Self::Stochastic(settings) => format!("stochastic {settings}"),
+            Self::MapTerms(settings, _) => format!("map + stochastic {settings}"),
             Self::Map(_) => "map".to_owned(),
             Self::Auto(_) => "auto".to_owned(),
         }
@@ -343,7 +349,9 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         Chosen::Exact => {}
         Chosen::Stochastic(settings) => stochastic = Some(Stochastic::new(*settings, &scene, &stage.bvh)?),
         Chosen::Auto(options) => auto = Some(Auto::new(*options)),
-        Chosen::Map(options) => prepared = Some(map::prepare(&stage, options, args.threads.into())?),
+        Chosen::MapTerms(_, options) | Chosen::Map(options) => {
+            prepared = Some(map::prepare(&stage, options, args.threads.into())?)
+        }
     }
     let volumetric = match (&chosen, args.volumetric) {
         (_, Some(switch)) => switch == Switch::On,
@@ -351,12 +359,20 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     };
     let volumes = volumetric.then(|| map::volumes(&scene, &lights, args.threads.into())).transpose()?;
     let occluders = volumes.as_ref().map(Volumes::occluders).unwrap_or_default();
-    let map = prepared.as_ref().map(|prepared| prepared.visibility().with_occluders(occluders.clone()));
+    let mut map = prepared.as_ref().map(|prepared| prepared.visibility().with_occluders(occluders.clone()));
+    let terms = match (&chosen, &mut map) {
+        (Chosen::MapTerms(settings, _), map) => {
+            map.take().map(|map| MapTerms::new(map, *settings, &scene)).transpose()?
+        }
+        _ => None,
+    };
+    let map = terms.as_ref().map(MapTerms::map).or(map.as_ref());
     let walled = volumes.is_some().then(|| Walled::new(occluders));
-    let method: &dyn Visibility = match (&stochastic, &map, &auto, &walled) {
+    let method: &dyn Visibility = match (&stochastic, &terms, map, &auto, &walled) {
         (Some(stochastic), ..) => stochastic,
-        (_, Some(map), ..) => map,
-        (_, _, Some(auto), _) => auto,
+        (_, Some(terms), ..) => terms,
+        (_, _, Some(map), ..) => map,
+        (_, _, _, Some(auto), _) => auto,
         (.., Some(walled)) => walled,
         _ => &Exact,
     };
@@ -417,7 +433,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
             bvh_bytes_per_triangle: accel.bytes() as f64 / accel.triangles().max(1) as f64,
             triangles: accel.triangles(),
         },
-        map: prepared.as_ref().zip(map.as_ref()).map(|(prepared, map)| prepared.figures(map)),
+        map: prepared.as_ref().zip(map).map(|(prepared, map)| prepared.figures(map)),
         volumes: volumes.as_ref().map(|volumes| (&volumes.stats).into()),
         error,
     };

@@ -3,6 +3,7 @@
 use super::{Ended, note};
 use crate::error::Result;
 use crate::page::{Folder, INDEX};
+use crate::reproduce::map::{self, map};
 use crate::reproduce::theory::{self, theory};
 use crate::reproduce::{Halted, Reproduced, Run, Watch};
 use clap::{Args, Subcommand};
@@ -26,6 +27,24 @@ enum What {
     ///
     /// Everything on it is run anew. Takes some minutes; nothing but this program is needed.
     Theory(TheoryArgs),
+    /// The occlusion map: time, tests, error and bias, and the thesis' table beside ours, as a page.
+    ///
+    /// Everything on it is run anew. Takes some minutes.
+    Map(MapPageArgs),
+}
+
+#[derive(Debug, Args)]
+struct MapPageArgs {
+    /// The folder to write index.html and the .csv files to.
+    #[arg(short, long, value_name = "FOLDER", default_value = "map")]
+    output: PathBuf,
+
+    /// A folder of scenes, of which columns and fence are added to the generated ones.
+    #[arg(long, value_name = "FOLDER")]
+    scenes: Option<PathBuf>,
+
+    #[command(flatten)]
+    common: CommonArgs,
 }
 
 #[derive(Debug, Args)]
@@ -34,6 +53,13 @@ struct TheoryArgs {
     #[arg(short, long, value_name = "FOLDER", default_value = "theory")]
     output: PathBuf,
 
+    #[command(flatten)]
+    common: CommonArgs,
+}
+
+/// What all of them take.
+#[derive(Debug, Args)]
+struct CommonArgs {
     /// Smaller pictures and fewer samples: seconds, not minutes.
     #[arg(long)]
     quick: bool,
@@ -57,8 +83,12 @@ struct TheoryArgs {
 
 /// Runs the command.
 pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
-    let What::Theory(args) = &args.what;
-    let folder = Folder::claim(&args.output, theory::MAKER, &theory::FILES, args.force)?;
+    let what = &args.what;
+    let (args, output, maker, files) = match what {
+        What::Theory(of) => (&of.common, &of.output, theory::MAKER, &theory::FILES[..]),
+        What::Map(of) => (&of.common, &of.output, map::MAKER, &map::FILES[..]),
+    };
+    let folder = Folder::claim(output, maker, files, args.force)?;
     let stop = super::interruptible("the page");
     let progress = Progress::new(args.quiet);
     let run = Run {
@@ -69,7 +99,11 @@ pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
         stop: &stop,
         watch: &progress,
     };
-    write(&folder, theory(&run), &progress, args.quiet)
+    let made = match what {
+        What::Theory(_) => theory(&run),
+        What::Map(of) => map(&run, of.scenes.as_deref()),
+    };
+    write(&folder, made, &progress, args.quiet)
 }
 
 /// Writes a page and what goes beside it.

@@ -7,8 +7,13 @@
 //! Biased: what the photons miss casts no shadow, and thin shadows and slits of light can be lost. It is the thesis'
 //! method; the exact one is [`Exact`](super::Exact).
 
-use super::{Questions, Stage, Visibility};
+mod terms;
+
+pub use terms::MapTerms;
+
+use super::{Questions, ShadingPoint, Stage, Visibility};
 use crate::accel::Quality;
+use crate::light::AreaLight;
 use crate::photons::{BlockerKind, BlockerSet, PhotonStore, Shower, default_lines};
 use crate::report::MapFigures;
 use occlude_kernel::lanes::{Task, dispatch};
@@ -188,7 +193,7 @@ impl<C: Counter> Task for Ask<'_, C> {
         let mut slots = vec![Neighbour::NONE; Nearest::room(prepared.k)];
         let mut nearest = Nearest::new(prepared.k, &mut slots).expect("room for k");
         let mut room = vec![0; ROOM];
-        let mut tracer = Tracer { blocks: Vec::new(), roots: Vec::new(), scratch: BatchScratch::new() };
+        let mut tracer = Tracer::new();
         let mut blocked = [0u64; MOST / 64];
         let mut hidden = [0u64; MOST / 64];
         let mut classes = [0; 4];
@@ -202,11 +207,7 @@ impl<C: Counter> Task for Ask<'_, C> {
             let class = photons.classify(&place, &mut nearest, &mut room);
             let list = match class {
                 Class::Lit => {
-                    // Such that the samples add up to what is known.
-                    let sum: f32 = questions.weights[samples.clone()].iter().sum();
-                    let whole =
-                        light.unshadowed(point.x, point.normal).unwrap_or(0.0) * FRAC_1_PI * batch.share;
-                    let each = if sum > 0.0 { whole / sum } else { 0.0 };
+                    let each = lit(light, point, &questions.weights[samples.clone()], batch.share);
                     estimates.resize(estimates.len() + samples.len(), each);
                     classes[0] += 1;
                     continue;
@@ -267,6 +268,13 @@ impl<C: Counter> Task for Ask<'_, C> {
     }
 }
 
+/// What each sample of a lit point counts, such that they add up to what is known.
+fn lit(light: &AreaLight, point: &ShadingPoint, weights: &[f32], share: f32) -> f32 {
+    let sum: f32 = weights.iter().sum();
+    let whole = light.unshadowed(point.x, point.normal).unwrap_or(0.0) * FRAC_1_PI * share;
+    if sum > 0.0 { whole / sum } else { 0.0 }
+}
+
 /// Samples asked about at once.
 const MOST: usize = 256;
 
@@ -278,6 +286,10 @@ struct Tracer {
 }
 
 impl Tracer {
+    fn new() -> Self {
+        Self { blocks: Vec::new(), roots: Vec::new(), scratch: BatchScratch::new() }
+    }
+
     /// Gathers what a list names: triangles by eights, or subtrees.
     fn aim_at(&mut self, blockers: &BlockerSet, stage: &Stage<'_>, list: &[u32]) {
         self.blocks.clear();

@@ -10,7 +10,7 @@ mod stochastic;
 
 pub use auto::{Auto, AutoOptions};
 pub use exact::{Exact, Walled};
-pub use map::{Classes, FLATNESS, Map, MapOptions, PreparedMap};
+pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
 use crate::film::{Tile, TileFilm};

@@ -1,5 +1,6 @@
 //! Reproduces tables and figures: runs what they are made of, and writes a page of it.
 
+pub mod map;
 pub mod theory;
 
 use crate::error::Error;

@@ -162,7 +162,7 @@ impl Settings {
 }
 
 /// Test rays for each point and light, as many as the thesis takes.
-const TEST_RAYS: usize = 64;
+pub(super) const TEST_RAYS: usize = 64;
 
 /// The least probability of a term that test rays speak for: half a ray of them.
 const LEAST: f64 = 0.5 / TEST_RAYS as f64;
@@ -530,7 +530,7 @@ impl<'a> Work<'a> {
 }
 
 /// The terms of least cost, or the thesis', for these answers of test rays.
-fn learned(settings: Settings, joint: &Joint) -> Option<OneTerm> {
+pub(super) fn learned(settings: Settings, joint: &Joint) -> Option<OneTerm> {
     let form = settings.form.decomposition();
     if settings.form == Form::Residual {
         let best = Decomposition::best_residual(joint, 1.0, 1.0, LEAST_REACH);

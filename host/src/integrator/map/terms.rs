@@ -1,0 +1,376 @@
+//! The occlusion map with stochastic visibility: of the blockers that photons name, a random part is asked.
+//!
+//! Lit and dark are as in [`Map`](super::Map). In a penumbra the names stand in two halves, drawn or sorted by distance
+//! for each point and light, and a shadow ray asks the halves that its random term wants. The estimates have the
+//! expectation of [`Map`](super::Map), which is biased, and may be negative or above one.
+
+use super::super::stochastic::{TEST_RAYS, learned};
+use super::super::{Batch, Questions, ShadingPoint, Split, Stage, Visibility};
+use super::{MOST, Map, ROOM, Tests, Tracer, lit};
+use crate::error::{Error, Result};
+use crate::integrator::{Rule, Settings};
+use crate::sampler::Sampler;
+use glam::Vec3;
+use occlude_kernel::lanes::{Task, dispatch};
+use occlude_kernel::photons::{Class, Nearest, Neighbour};
+use occlude_kernel::{
+    Counter, Counts, OneTerm, Probabilities, Quotas, Simd, Tally, Targets, Uncounted, offset,
+};
+use std::sync::atomic::Ordering;
+
+/// Asks random terms of what photons name.
+#[derive(Debug)]
+pub struct MapTerms<'a> {
+    map: Map<'a>,
+    settings: Settings,
+    fixed: OneTerm,
+    /// The middle of each blocker, if they are sorted.
+    middles: Vec<Vec3>,
+}
+
+impl<'a> MapTerms<'a> {
+    /// Over the blockers of a map; an error if the settings do not go together.
+    ///
+    /// Two groups only, and random or sorted.
+    pub fn new(map: Map<'a>, settings: Settings, scene: &crate::scene::Scene) -> Result<Self> {
+        let settings = Self::checked(settings)?;
+        let fixed = OneTerm::new(settings.form.decomposition(), &Probabilities::UNIFORM)
+            .map_err(|error| Error::Usage(error.to_string()))?;
+        let blockers = &map.prepared.blockers;
+        let triangles = scene.triangles.len();
+        let mut middles = Vec::new();
+        if settings.split == Split::Sorted {
+            let mut sums = vec![(Vec3::ZERO, 0.0f32); blockers.count(triangles)];
+            for triangle in 0..triangles as u32 {
+                let (sum, count) = &mut sums[blockers.of(triangle) as usize];
+                *sum += scene.vertices(triangle).iter().sum::<Vec3>() / 3.0;
+                *count += 1.0;
+            }
+            middles = sums.iter().map(|(sum, count)| *sum / count.max(1.0)).collect();
+        }
+        Ok(Self { map, settings, fixed, middles })
+    }
+
+    /// The same settings, if they go with the blockers of a map.
+    pub fn checked(settings: Settings) -> Result<Settings> {
+        let settings = settings.checked()?;
+        if settings.groups > 2 {
+            return Err(Error::Usage(
+                "--levels above 2 wants --blockers all: what photons name stands in two groups".into(),
+            ));
+        }
+        if settings.split == Split::Object {
+            return Err(Error::Usage(
+                "--split object wants --blockers all; with --blockers map it is random or sorted, and \
+                 --blocker-kind object names objects"
+                    .into(),
+            ));
+        }
+        Ok(settings)
+    }
+
+    /// The map asked.
+    pub fn map(&self) -> &Map<'a> {
+        &self.map
+    }
+}
+
+impl Visibility for MapTerms<'_> {
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        estimates.clear();
+        let classes = if stage.count {
+            dispatch(stage.level, Ask { method: self, stage, questions, estimates, counter: counts })
+        } else {
+            dispatch(stage.level, Ask { method: self, stage, questions, estimates, counter: &mut Uncounted })
+        };
+        for (total, of_tile) in self.map.classes.0.iter().zip(classes) {
+            total.fetch_add(of_tile, Ordering::Relaxed);
+        }
+    }
+}
+
+/// All batches of a tile.
+struct Ask<'a, C> {
+    method: &'a MapTerms<'a>,
+    stage: &'a Stage<'a>,
+    questions: &'a Questions,
+    estimates: &'a mut Vec<f32>,
+    counter: &'a mut C,
+}
+
+impl<C: Counter> Task for Ask<'_, C> {
+    type Output = [u64; 4];
+
+    /// Everything but the queries is bookkeeping, and stands in [`Work`].
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> [u64; 4] {
+        let Self { method, stage, questions, estimates, counter } = self;
+        let map = &method.map;
+        let prepared = map.prepared;
+        let bvh = stage.bvh.on(simd);
+        let mut slots = vec![Neighbour::NONE; Nearest::room(prepared.k)];
+        let mut nearest = Nearest::new(prepared.k, &mut slots).expect("room for k");
+        let mut room = vec![0; ROOM];
+        let mut tracers = [Tracer::new(), Tracer::new()];
+        let mut blocked = [0u64; MOST / 64];
+        let mut classes = [0; 4];
+        let mut work = Work::new(method);
+        for batch in &questions.batches {
+            let point = &questions.points[batch.point as usize];
+            let light = &stage.lights[batch.light as usize];
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let place = prepared.place(batch.light as usize, point.x, point.normal);
+            let photons = map.photons[batch.light as usize].on(simd);
+            let class = photons.classify(&place, &mut nearest, &mut room);
+            let known = match class {
+                Class::Lit => {
+                    let each = lit(light, point, &questions.weights[samples.clone()], batch.share);
+                    estimates.resize(estimates.len() + samples.len(), each);
+                    classes[0] += 1;
+                    continue;
+                }
+                Class::Dark => {
+                    estimates.resize(estimates.len() + samples.len(), 0.0);
+                    classes[1] += 1;
+                    continue;
+                }
+                Class::Penumbra(blockers) => {
+                    classes[2] += 1;
+                    work.divide(point, batch, blockers.list);
+                    tracers[0].aim_at(&prepared.blockers, stage, &work.names[..work.half]);
+                    tracers[1].aim_at(&prepared.blockers, stage, &work.names[work.half..]);
+                    work.begin(stage, point, batch);
+                    true
+                }
+                Class::Unknown => {
+                    classes[3] += 1;
+                    false
+                }
+            };
+            let x = point.origin.to_array();
+            if !known {
+                // The scene is asked, for every sample.
+                work.all(questions, batch);
+                let mut from = 0;
+                while from < samples.len() {
+                    let part = from..samples.len().min(from + MOST);
+                    from = part.end;
+                    let [tx, ty, tz] = &work.asked;
+                    let Some(targets) = Targets::new(&tx[part.clone()], &ty[part.clone()], &tz[part.clone()])
+                    else {
+                        continue;
+                    };
+                    let targets = targets.on_parallelogram(light.corner, light.u, light.v);
+                    let words = &mut blocked[..part.len().div_ceil(64)];
+                    let scratch = &mut tracers[0].scratch;
+                    bvh.occluded_batch(point.origin, &targets, None, counter, scratch, words);
+                    for i in 0..part.len() {
+                        estimates.push(if blocked[i / 64] >> (i % 64) & 1 == 0 { 1.0 } else { 0.0 });
+                    }
+                }
+                continue;
+            }
+            counter.rays(samples.len() as u32);
+            loop {
+                // Several fields go by the number.
+                #[allow(clippy::needless_range_loop)]
+                for group in 0..2 {
+                    work.gather(questions, batch, group);
+                    let list = if group == 0 { &work.names[..work.half] } else { &work.names[work.half..] };
+                    if list.is_empty() {
+                        work.free(group);
+                        continue;
+                    }
+                    let mut from = 0;
+                    while from < work.places.len() {
+                        let part = from..work.places.len().min(from + MOST);
+                        from = part.end;
+                        let [tx, ty, tz] = &work.asked;
+                        let Some(targets) =
+                            Targets::new(&tx[part.clone()], &ty[part.clone()], &tz[part.clone()])
+                        else {
+                            continue;
+                        };
+                        let targets = targets.on_parallelogram(light.corner, light.u, light.v);
+                        let words = &mut blocked[..part.len().div_ceil(64)];
+                        let blockers = (&prepared.blockers, &map.objects[..]);
+                        let mut tests = Tests(&mut *counter);
+                        tracers[group].trace(blockers, (simd, bvh), list, x, &targets, &mut tests, words);
+                        for (i, &place) in work.places[part].iter().enumerate() {
+                            work.visible[place as usize][group] = blocked[i / 64] >> (i % 64) & 1 == 0;
+                        }
+                    }
+                }
+                if work.finish(batch, estimates) {
+                    break;
+                }
+            }
+        }
+        classes
+    }
+}
+
+/// The batch at hand: first its test rays, if probabilities are learned, and then its samples.
+struct Work<'a> {
+    method: &'a MapTerms<'a>,
+    random: Sampler,
+    point: Option<u32>,
+    /// What photons name, one group after the other, and where the second begins.
+    names: Vec<u32>,
+    half: usize,
+    order: Vec<(f32, u32)>,
+    one: OneTerm,
+    testing: bool,
+    tests: [Vec<f32>; 3],
+    square: Vec<[f32; 2]>,
+    choices: Vec<u32>,
+    visible: Vec<[bool; 2]>,
+    places: Vec<u32>,
+    asked: [Vec<f32>; 3],
+}
+
+impl<'a> Work<'a> {
+    fn new(method: &'a MapTerms<'a>) -> Self {
+        Self {
+            method,
+            random: Sampler::from_key(0),
+            point: None,
+            names: Vec::new(),
+            half: 0,
+            order: Vec::new(),
+            one: method.fixed,
+            testing: false,
+            tests: Default::default(),
+            square: Vec::new(),
+            choices: Vec::new(),
+            visible: Vec::new(),
+            places: Vec::new(),
+            asked: Default::default(),
+        }
+    }
+
+    /// Puts the names in two halves.
+    fn divide(&mut self, point: &ShadingPoint, batch: &Batch, list: &[u32]) {
+        if self.point != Some(batch.point) {
+            self.point = Some(batch.point);
+            self.random = Sampler::from_key(point.key);
+        }
+        self.names.clear();
+        self.names.extend_from_slice(list);
+        self.half = list.len().div_ceil(2);
+        if self.method.settings.split == Split::Sorted {
+            let far = |name: u32| self.method.middles[name as usize].distance_squared(point.x);
+            self.order.clear();
+            self.order.extend(list.iter().map(|&name| (far(name), name)));
+            self.order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
+            self.names.iter_mut().zip(&self.order).for_each(|(name, (_, sorted))| *name = *sorted);
+        } else {
+            for i in (1..self.names.len()).rev() {
+                let j = (u64::from(self.random.word()) * (i as u64 + 1)) >> 32;
+                self.names.swap(i, j as usize);
+            }
+        }
+    }
+
+    fn begin(&mut self, stage: &Stage<'_>, point: &ShadingPoint, batch: &Batch) {
+        self.one = self.method.fixed;
+        self.testing = self.method.settings.rule != Rule::Uniform;
+        if !self.testing {
+            self.choose(batch);
+            return;
+        }
+        let light = &stage.lights[batch.light as usize];
+        self.tests.iter_mut().for_each(Vec::clear);
+        self.square.clear();
+        self.random.points(stage.pattern, TEST_RAYS, &mut self.square);
+        for &at in &self.square {
+            let y = light.point(at);
+            let path = y - point.x;
+            if light.normal.dot(path) < 0.0 && point.normal.dot(path) > 0.0 {
+                let target = offset(y, light.normal, stage.bvh.clearance());
+                (0..3).for_each(|axis| self.tests[axis].push(target[axis]));
+            }
+        }
+        self.visible.clear();
+        self.visible.resize(self.tests[0].len(), [true; 2]);
+    }
+
+    /// Draws the terms of all samples.
+    fn choose(&mut self, batch: &Batch) {
+        let count = batch.samples.len();
+        let (offset, seed) = (self.random.uniform(), self.random.word());
+        let quotas = self.method.settings.quotas.then(|| Quotas::new(count as u32, offset, seed));
+        self.choices.clear();
+        for k in 0..count as u32 {
+            let u = match &quotas {
+                Some(quotas) => quotas.number(k),
+                None => self.random.uniform(),
+            };
+            self.choices.push(self.one.choose(u) as u32);
+        }
+        self.visible.clear();
+        self.visible.resize(count, [true; 2]);
+    }
+
+    /// Collects the samples that want to know of a group.
+    fn gather(&mut self, questions: &Questions, batch: &Batch, group: usize) {
+        self.places.clear();
+        if self.testing {
+            self.places.extend(0..self.visible.len() as u32);
+        } else {
+            for (place, (&choice, visible)) in (0u32..).zip(self.choices.iter().zip(&self.visible)) {
+                let needs = self.one.needs(choice as usize);
+                if if group == 0 { needs.a } else { needs.b.given(visible[0]) } {
+                    self.places.push(place);
+                }
+            }
+        }
+        let samples = batch.samples.start as usize..batch.samples.end as usize;
+        for (axis, asked) in self.asked.iter_mut().enumerate() {
+            let from =
+                if self.testing { &self.tests[axis][..] } else { &questions.targets[axis][samples.clone()] };
+            asked.clear();
+            asked.extend(self.places.iter().map(|&place| from[place as usize]));
+        }
+    }
+
+    /// All samples, for the scene to be asked.
+    fn all(&mut self, questions: &Questions, batch: &Batch) {
+        let samples = batch.samples.start as usize..batch.samples.end as usize;
+        for (asked, from) in self.asked.iter_mut().zip(&questions.targets) {
+            asked.clear();
+            asked.extend_from_slice(&from[samples.clone()]);
+        }
+    }
+
+    /// A group without blockers lets everything through.
+    fn free(&mut self, group: usize) {
+        for &place in &self.places {
+            self.visible[place as usize][group] = true;
+        }
+    }
+
+    /// After test rays, turns to the samples; after samples, writes their estimates and is done.
+    fn finish(&mut self, batch: &Batch, estimates: &mut Vec<f32>) -> bool {
+        if self.testing {
+            self.testing = false;
+            let mut tally = Tally::default();
+            self.visible.iter().for_each(|[a, b]| tally.add(*a, *b));
+            let joint = tally.joint();
+            if let Some(one) = joint.and_then(|joint| learned(self.method.settings, &joint)) {
+                self.one = one;
+            }
+            self.choose(batch);
+            return false;
+        }
+        let value = |(&choice, &[a, b]): (&u32, &[bool; 2])| self.one.value(choice as usize, a, b);
+        estimates.extend(self.choices.iter().zip(&self.visible).map(value));
+        true
+    }
+}
