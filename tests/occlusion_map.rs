@@ -42,7 +42,7 @@ fn over_all_starts_every_segment_is_asked_with_its_chance_and_corrected_to_its_v
                 asked[i] += u32::from(toss);
                 for free in [false, true] {
                     let correction = if toss { odds.correction(&chances, free) } else { 0.0 };
-                    sums[i][usize::from(free)] += f64::from(odds.guess()) + f64::from(correction);
+                    sums[i][usize::from(free)] += f64::from(odds.guess(&chances)) + f64::from(correction);
                 }
             }
         }
@@ -160,7 +160,8 @@ fn cells_learn_what_they_saw() {
     assert!(class(expected[0]) > class(expected[3]), "near the border there is more doubt");
     cell.learn(Some(&expected), &chances, 1.0);
     assert_eq!(cell.known([0.0; 3]), Known::Bins);
-    assert!(cell.odds(0).guess() > 0.99 && cell.odds(7).guess() < 0.01);
+    assert!(cell.odds(0).guess(&chances) > 0.99 && cell.odds(7).guess(&chances) == 0.0);
+    assert_eq!(cell.odds(0).guess(&Chances::ALL), 0.0, "nothing is left to guess");
     cell.learn(Some(&expected), &chances, 0.2);
     assert_eq!(cell.known([0.0; 3]), Known::All, "a quarter is more than a fifth");
     cell.learn(Some(&[0.0; BINS]), &chances, 1.0);
@@ -170,7 +171,7 @@ fn cells_learn_what_they_saw() {
     cell.set_lit();
     cell.learn(Some(&[0.5; BINS]), &chances, 1.0);
     assert_eq!(cell.known([0.25, 0.25, 0.0]), Known::Lit);
-    assert!(matches!(cell.known([0.25, 0.5, 0.0]), Known::Flat(odds) if odds.guess() == 1.0));
+    assert!(matches!(cell.known([0.25, 0.5, 0.0]), Known::Flat(odds) if odds.guess(&chances) == 1.0));
     cell.add([0.25, 0.5, 0.0]);
     assert!(!cell.is_lit(), "it grew");
 }

@@ -300,8 +300,9 @@ impl MapCell {
         Some(expected)
     }
 
-    /// Makes odds of what one expects: u is that, and the class of doubt follows from the variance u (1 - u). Nothing
-    /// to expect, and a cell knows nothing. What is lit stays so.
+    /// Makes odds of what one expects, p: u is p, or 0 where p is below a half, so that dark places do not become
+    /// negative; and the class of doubt follows from the variance p (1 - p). Nothing to expect, and a cell knows
+    /// nothing. What is lit stays so.
     ///
     /// Where more than this part of the rays would be asked, all are from then on.
     pub fn learn(&mut self, expected: Option<&[f32; BINS]>, chances: &Chances, most: f32) {
@@ -311,7 +312,7 @@ impl MapCell {
         };
         let mut sum = 0;
         for (bin, &p) in expected.iter().enumerate() {
-            self.u[bin] = (p * 255.0 + 0.5) as u8;
+            self.u[bin] = if p < 0.5 { 0 } else { (p * 255.0 + 0.5) as u8 };
             self.class[bin] = class(p) as u8;
             sum += u32::from(chances.of(self.class[bin]));
         }
@@ -475,17 +476,17 @@ pub struct Odds {
 }
 
 impl Odds {
-    /// What is thought of a segment that is not asked.
+    /// What is thought of a segment that is not asked: u, and 0 where all are asked, when a guess would only add rounding.
     #[inline(always)]
-    pub fn guess(self) -> f32 {
-        unit(self.u)
+    pub fn guess(self, chances: &Chances) -> f32 {
+        if u32::from(chances.of(self.class)) == LEAST_CHANCE { 0.0 } else { unit(self.u) }
     }
 
     /// What a ray adds to the guess: `(V - u)/q`.
     #[inline(always)]
     pub fn correction(self, chances: &Chances, free: bool) -> f32 {
         let visible = if free { 1.0 } else { 0.0 };
-        (visible - self.guess()) * (LEAST_CHANCE as f32 / f32::from(chances.of(self.class)))
+        (visible - self.guess(chances)) * (LEAST_CHANCE as f32 / f32::from(chances.of(self.class)))
     }
 }
 

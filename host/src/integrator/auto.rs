@@ -289,7 +289,7 @@ fn choose(cell: &MapCell, chances: &Chances, fan: &Fan, coin: &mut Coin, some: &
     let (mut kept, mut sum) = (0, 0.0);
     for i in 0..count {
         let odds = cell.odds(usize::from(bins[i]) % BINS);
-        sum += odds.guess() * weights[i];
+        sum += odds.guess(chances) * weights[i];
         some_of[kept] = i as u32;
         kept += usize::from(coin.toss(chances.of(odds.class)) & (weights[i] > 0.0));
     }
@@ -495,7 +495,7 @@ impl Visibility for Auto {
                         square.retain(|_| coin.toss(chance));
                         fan.open(stage, area, &point, square, each);
                         some.extend((0..).zip(&fan.weights).filter(|(_, w)| **w > 0.0).map(|(i, _)| i));
-                        odds.guess() * unshadowed * FRAC_1_PI * share
+                        odds.guess(&map.chances) * unshadowed * FRAC_1_PI * share
                     }
                     (Known::Bins, Some(index)) => {
                         fan.open(stage, area, &point, square, each);
