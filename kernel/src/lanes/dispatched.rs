@@ -78,8 +78,14 @@ pub fn dispatch<T: Task>(level: Level, task: T) -> T::Output {
     dispatch_rest(level, task)
 }
 
-/// Levels of other machines. No x86-64 comes here, where SSE2 is always there.
-#[cfg(target_arch = "x86_64")]
+/// Levels of other machines. Nobody comes here but with levels left out of the build: SSE2 is part of x86-64, unless it is
+/// switched off. One number at a time would be one more copy of every task to compile.
+#[cfg(all(target_arch = "x86_64", target_feature = "sse2", not(occlude_one_level)))]
+fn dispatch_rest<T: Task>(_: Level, _: T) -> T::Output {
+    unreachable!("x86-64 has SSE2")
+}
+
+#[cfg(all(target_arch = "x86_64", any(not(target_feature = "sse2"), occlude_one_level)))]
 fn dispatch_rest<T: Task>(_: Level, task: T) -> T::Output {
     task.run(super::Scalar)
 }
