@@ -86,6 +86,8 @@ struct Map {
     /// And what follows from that.
     chances: Chances,
     passes: u32,
+    /// Strays that a tile may report, so that they take no more memory than the cells may.
+    most_strays: usize,
     /// About what a shadow ray costs, ns.
     ray: f64,
     /// Is there room for no more cells?
@@ -105,6 +107,7 @@ impl Default for Map {
             doubts: Doubts::default(),
             chances: Chances::ALL,
             passes: 0,
+            most_strays: 0,
             ray: 4.0,
             full: false,
         }
@@ -419,7 +422,8 @@ impl Visibility for Auto {
         let mut map = self.map.write().unwrap_or_else(|poisoned| poisoned.into_inner());
         let ahead = stage.camera.ray_direction(0.5 * width as f32, 0.5 * width as f32);
         let beside = stage.camera.ray_direction(0.5 * width as f32 + 1.0, 0.5 * width as f32);
-        *map = Map { angle: (beside - ahead).length() / ahead.length(), ..Map::default() };
+        let most_strays = self.options.memory / size_of::<Stray>() / tiles.len().max(1);
+        *map = Map { angle: (beside - ahead).length() / ahead.length(), most_strays, ..Map::default() };
         let found = &*map;
         let strays: Vec<Vec<Stray>> = tiles
             .par_iter()
@@ -441,6 +445,7 @@ impl Visibility for Auto {
                         }
                     }
                 }
+                strays.truncate(most_strays);
                 strays
             })
             .collect();
@@ -476,7 +481,8 @@ impl Visibility for Auto {
                     continue;
                 }
                 let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
-                if let (Some(key), true) = (key, outside && !(map.full && cell.is_none())) {
+                let wanted = outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays;
+                if let (Some(key), true) = (key, wanted) {
                     strays.push(Stray { key, origin: point.origin, normal: point.normal });
                 }
                 if count == 0 {
