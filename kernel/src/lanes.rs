@@ -79,6 +79,9 @@ pub trait Simd: Copy + Debug + Send + Sync + 'static {
     type Packet: Lanes<Token = Self::Token>;
     /// The token.
     fn token(self) -> Self::Token;
+    /// Does work in a function of its own that is compiled for this family's instructions: for what is large and
+    /// stands in several places, so that each does not get a copy. `work` and all it calls must be `#[inline(always)]`.
+    fn apart<R>(self, work: impl FnOnce() -> R) -> R;
 }
 
 /// One lane: the reference.
@@ -92,6 +95,11 @@ impl Simd for Scalar {
 
     #[inline(always)]
     fn token(self) {}
+
+    #[inline]
+    fn apart<R>(self, work: impl FnOnce() -> R) -> R {
+        work()
+    }
 }
 
 impl Mask for bool {
@@ -179,6 +187,11 @@ impl Simd for Native {
 
     #[inline(always)]
     fn token(self) {}
+
+    #[inline]
+    fn apart<R>(self, work: impl FnOnce() -> R) -> R {
+        work()
+    }
 }
 
 /// Implements [`Lanes`] for a vector of `wide`, whose masks are vectors too.

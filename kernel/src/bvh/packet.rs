@@ -328,9 +328,24 @@ impl<S: Simd> Bvh<'_, S> {
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
-        if self.nodes.is_empty() {
-            return;
+        if !self.nodes.is_empty() {
+            self.simd.apart(
+                #[inline(always)]
+                || self.traverse_axes(start, rays, active, part, counter, visitor),
+            );
         }
+    }
+
+    #[inline(always)]
+    fn traverse_axes<V: PacketVisitor<S::Packet>>(
+        &self,
+        start: &Start<'_>,
+        rays: &Rays<S::Packet>,
+        active: u32,
+        part: impl Part,
+        counter: &mut impl Counter,
+        visitor: &mut V,
+    ) {
         let token = self.simd.token();
         let infinity = S::Packet::splat(token, f32::INFINITY);
         let length = vec3x::abs(rays.direction);

@@ -167,6 +167,22 @@ impl Pyramid {
         count: usize,
         magnitude: f32,
     ) -> bool {
+        simd.apart(
+            #[inline(always)]
+            || self.aim_here(simd, x, targets, from, count, magnitude),
+        )
+    }
+
+    #[inline(always)]
+    fn aim_here<S: Simd>(
+        &mut self,
+        simd: S,
+        x: Vec3,
+        targets: &Targets<'_>,
+        from: usize,
+        count: usize,
+        magnitude: f32,
+    ) -> bool {
         let token = simd.token();
         let this = self;
         this.x = x;
@@ -772,6 +788,22 @@ impl<S: Simd> Bvh<'_, S> {
     /// it, the rest is left on the stack.
     #[inline(always)]
     pub(super) fn pyramid_goes_on(
+        &self,
+        pyramid: &mut Pyramid,
+        stack: &mut Stack,
+        going: &mut Going,
+        part: impl Part,
+        counter: &mut impl Counter,
+        learner: &mut impl Learner,
+    ) {
+        self.simd.apart(
+            #[inline(always)]
+            || self.pyramid_visits(pyramid, stack, going, part, counter, learner),
+        );
+    }
+
+    #[inline(always)]
+    fn pyramid_visits(
         &self,
         pyramid: &mut Pyramid,
         stack: &mut Stack,

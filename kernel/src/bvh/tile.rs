@@ -386,6 +386,23 @@ impl<S: Simd> Bvh<'_, S> {
         ignore: Option<u32>,
         counter: &mut impl Counter,
     ) -> u64 {
+        self.simd.apart(
+            #[inline(always)]
+            || self.list_asked(batch, list, ask, may_go, ignore, counter),
+        )
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn list_asked(
+        &self,
+        batch: &mut BatchScratch,
+        list: &mut List,
+        ask: u64,
+        may_go: bool,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> u64 {
         let pyramid = &batch.pyramid;
         let mut going = Going::new(ask);
         let mut k = 0;
@@ -528,6 +545,22 @@ impl<S: Simd> Bvh<'_, S> {
     /// in it is below the cut.
     #[inline(always)]
     fn gather(
+        &self,
+        shaft: &Shaft,
+        rays: usize,
+        points: usize,
+        cut: &mut Cut,
+        list: &mut List,
+        counter: &mut impl Counter,
+    ) -> bool {
+        self.simd.apart(
+            #[inline(always)]
+            || self.gather_here(shaft, rays, points, cut, list, counter),
+        )
+    }
+
+    #[inline(always)]
+    fn gather_here(
         &self,
         shaft: &Shaft,
         rays: usize,

@@ -25,6 +25,11 @@ impl<S: fearless_simd::Simd> Simd for Dispatched<S> {
     fn token(self) -> S {
         self.0
     }
+
+    #[inline(always)]
+    fn apart<R>(self, work: impl FnOnce() -> R) -> R {
+        fearless_simd::Simd::vectorize(self.0, work)
+    }
 }
 
 #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
@@ -36,6 +41,11 @@ impl Simd for Dispatched16 {
     #[inline(always)]
     fn token(self) -> Avx512 {
         self.0
+    }
+
+    #[inline(always)]
+    fn apart<R>(self, work: impl FnOnce() -> R) -> R {
+        fearless_simd::Simd::vectorize(self.0, work)
     }
 }
 
@@ -80,12 +90,12 @@ pub fn dispatch<T: Task>(level: Level, task: T) -> T::Output {
 
 /// Levels of other machines. Nobody comes here but with levels left out of the build: SSE2 is part of x86-64, unless it is
 /// switched off. One number at a time would be one more copy of every task to compile.
-#[cfg(all(target_arch = "x86_64", target_feature = "sse2", not(occlude_one_level)))]
+#[cfg(all(target_arch = "x86_64", any(target_feature = "sse2", occlude_one_level)))]
 fn dispatch_rest<T: Task>(_: Level, _: T) -> T::Output {
-    unreachable!("x86-64 has SSE2")
+    unreachable!("a level that this was not compiled for")
 }
 
-#[cfg(all(target_arch = "x86_64", any(not(target_feature = "sse2"), occlude_one_level)))]
+#[cfg(all(target_arch = "x86_64", not(target_feature = "sse2"), not(occlude_one_level)))]
 fn dispatch_rest<T: Task>(_: Level, task: T) -> T::Output {
     task.run(super::Scalar)
 }
@@ -141,13 +151,13 @@ pub fn level_name(level: Level) -> &'static str {
 /// The levels this CPU can run, best first.
 pub fn levels() -> impl Iterator<Item = Level> {
     let best = detect();
-    #[cfg(any(target_arch = "x86", target_arch = "x86_64"))]
+    #[cfg(all(any(target_arch = "x86", target_arch = "x86_64"), not(occlude_one_level)))]
     let lower = [
         best.as_avx2().map(Level::Avx2),
         best.as_sse4_2().map(Level::Sse4_2),
         best.as_sse2().map(Level::Sse2),
     ];
-    #[cfg(not(any(target_arch = "x86", target_arch = "x86_64")))]
+    #[cfg(any(occlude_one_level, not(any(target_arch = "x86", target_arch = "x86_64"))))]
     let lower: [Option<Level>; 0] = [];
     let name = level_name(best);
     core::iter::once(best).chain(lower.into_iter().flatten().filter(move |&level| level_name(level) != name))
