@@ -64,10 +64,11 @@ pub fn dispatch<T: Task>(level: Level, task: T) -> T::Output {
     // Not the macro of `fearless_simd`: it would compile the task for AVX-512 a second time, in eight lanes.
     #[cfg(target_arch = "x86_64")]
     {
+        #[cfg(not(occlude_one_level = "avx2"))]
         if let Some(token) = level.as_avx512() {
             return vectorize(token, task, Dispatched16(token));
         }
-        #[cfg(not(occlude_one_level))]
+        #[cfg(any(not(occlude_one_level), occlude_one_level = "avx2"))]
         if let Some(token) = level.as_avx2() {
             return vectorize(token, task, Dispatched(token));
         }
