@@ -204,8 +204,8 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
         .collect();
     let (distance, depth, reinsertion) = match quality {
         Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
-        Quality::Medium => (PlocSearchDistance::Medium, 3, 0.05),
-        Quality::High => (PlocSearchDistance::High, 2, 0.5),
+        Quality::Medium => (PlocSearchDistance::Medium, 3, 0.4),
+        Quality::High => (PlocSearchDistance::High, 2, 1.0),
     };
     let indices = (0..boxes.len() as u32).collect();
     let mut binary =
