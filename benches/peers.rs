@@ -43,6 +43,9 @@ struct Options {
     /// spheres and cities at 16 rays a point and light; with -o writes NAME.csv and NAME.svg.
     #[arg(long, value_name = "MOST", value_parser = clap::value_parser!(u32).range(3..=8))]
     scaling: Option<u32>,
+    /// Only these peers, by the beginnings of their names (tile, embree 16, obvhs); for profiles.
+    #[arg(long, value_delimiter = ',')]
+    peers: Vec<String>,
     /// Also print how many tests our queries make.
     #[arg(long)]
     counts: bool,
@@ -207,6 +210,8 @@ fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Reco
             record.embree = Some(fast.version());
         }
     }
+    let named = |peer: &Peer<'_>| options.peers.iter().any(|name| peer.name.starts_with(name.as_str()));
+    peers.retain(|peer| options.peers.is_empty() || named(peer));
     eprintln!("{}", row.describe());
 
     for &rays in &options.rays {

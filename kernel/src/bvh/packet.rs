@@ -159,7 +159,6 @@ impl<L: Lanes, F: FnMut(usize, Hit) -> ControlFlow<()>> PacketVisitor<L> for Eac
 
 /// The rays of a packet, one by one, as the tests of one ray want them.
 struct Ends {
-    filled: bool,
     slabs: [[[f32; 16]; 3]; 3],
     origin: [[f32; 16]; 3],
     direction: [[f32; 16]; 3],
@@ -168,29 +167,25 @@ struct Ends {
 }
 
 impl Ends {
-    const NONE: Self = Self {
-        filled: false,
-        slabs: [[[0.0; 16]; 3]; 3],
-        origin: [[0.0; 16]; 3],
-        direction: [[0.0; 16]; 3],
-        shear: [[0.0; 16]; 3],
-        t_min: [0.0; 16],
-    };
-
     #[inline(always)]
-    fn fill<L: Lanes>(&mut self, slabs: &PacketSlabs<L>, sheared: &Sheared<L>) {
-        if !self.filled {
-            self.filled = true;
-            slabs.store(&mut self.slabs);
-            let mut axis = 0;
-            while axis < 3 {
-                sheared.origin[axis].store(&mut self.origin[axis]);
-                sheared.direction[axis].store(&mut self.direction[axis]);
-                sheared.shear[axis].store(&mut self.shear[axis]);
-                axis += 1;
-            }
-            sheared.t_min.store(&mut self.t_min);
+    fn of<L: Lanes>(slabs: &PacketSlabs<L>, sheared: &Sheared<L>) -> Self {
+        let mut ends = Self {
+            slabs: [[[0.0; 16]; 3]; 3],
+            origin: [[0.0; 16]; 3],
+            direction: [[0.0; 16]; 3],
+            shear: [[0.0; 16]; 3],
+            t_min: [0.0; 16],
+        };
+        slabs.store(&mut ends.slabs);
+        let mut axis = 0;
+        while axis < 3 {
+            sheared.origin[axis].store(&mut ends.origin[axis]);
+            sheared.direction[axis].store(&mut ends.direction[axis]);
+            sheared.shear[axis].store(&mut ends.shear[axis]);
+            axis += 1;
         }
+        sheared.t_min.store(&mut ends.t_min);
+        ends
     }
 
     /// The same numbers as in the packet's lane: shear and origin decide answers.
@@ -207,8 +202,10 @@ impl Ends {
     }
 }
 
-/// As many rays of a packet or fewer go on one by one.
-const ALONE: u32 = 5;
+/// As many rays of a packet or fewer go on one by one: of sixteen 5, of eight 3.
+const fn alone(width: usize) -> u32 {
+    width as u32 / 4 + 1
+}
 
 impl<S: Simd> Bvh<'_, S> {
     /// Which of the rays of `active` does anything but `ignore` block? A bit for each.
@@ -392,12 +389,12 @@ impl<S: Simd> Bvh<'_, S> {
     ) {
         let token = self.simd.token();
         let sheared = Sheared::new(token, axes, rays.origin, rays.direction, rays.t_min, rays.t_max);
-        let mut this = Going { sheared, t_max: [0.0; 16], found: Found::NOTHING, active, entry: [0.0; 16] };
+        let mut this = Going { sheared, t_max: [0.0; 16], active };
         this.sheared.t_max.store(&mut this.t_max);
         // The child, the rays that meet its box, and where the first of them enters it.
         let mut stack = ArrayVec::<(Child, u32, f32), STACK>::new();
         // Rays one by one, once they are wanted.
-        let mut ends = Ends::NONE;
+        let mut ends = None;
         let mut k = 0;
         while k < start.blocks.len() {
             self.meet_block(&start.blocks[k], active, &mut this, part, counter, visitor);
@@ -425,8 +422,11 @@ impl<S: Simd> Bvh<'_, S> {
             if meet == 0 {
                 continue;
             }
-            if V::ANY && meet.count_ones() <= ALONE {
-                ends.fill(slabs, &this.sheared);
+            if V::ANY && meet.count_ones() <= alone(S::Packet::WIDTH) {
+                if ends.is_none() {
+                    ends = Some(Ends::of(slabs, &this.sheared));
+                }
+                let Some(ends) = &ends else { return };
                 let mut left = meet;
                 while left != 0 {
                     let lane = left.trailing_zeros() as usize & 15;
@@ -439,7 +439,7 @@ impl<S: Simd> Bvh<'_, S> {
                             1 << lane,
                             &self.blocks[place.block],
                             place.lane,
-                            &this.found,
+                            &Found::NOTHING,
                             &mut this.t_max,
                         );
                     }
@@ -491,11 +491,16 @@ impl<S: Simd> Bvh<'_, S> {
             if bits == 0 {
                 continue;
             }
-            crossing.det.store(&mut this.found.det);
-            crossing.t.store(&mut this.found.t);
-            crossing.u.store(&mut this.found.u);
-            crossing.v.store(&mut this.found.v);
-            this.active &= !visitor.hits(bits, block, at, &this.found, &mut this.t_max);
+            this.active &= !if V::ANY {
+                visitor.hits(bits, block, at, &Found::NOTHING, &mut this.t_max)
+            } else {
+                let mut found = Found::NOTHING;
+                crossing.det.store(&mut found.det);
+                crossing.t.store(&mut found.t);
+                crossing.u.store(&mut found.u);
+                crossing.v.store(&mut found.v);
+                visitor.hits(bits, block, at, &found, &mut this.t_max)
+            };
             if this.active == 0 {
                 return;
             }
@@ -530,8 +535,9 @@ impl<S: Simd> Bvh<'_, S> {
                     // Depth is checked at construction, so there is always room.
                     stack.push((child, meet, 0.0));
                     if V::ORDERED {
-                        enter.store(&mut this.entry);
-                        let at = this.entry[meet.trailing_zeros() as usize & 15];
+                        let mut entry = [0.0; 16];
+                        enter.store(&mut entry);
+                        let at = entry[meet.trailing_zeros() as usize & 15];
                         let mut slot = stack.len() - 1;
                         while slot > first && stack[slot - 1].2 < at {
                             stack[slot] = stack[slot - 1];
@@ -550,10 +556,8 @@ impl<S: Simd> Bvh<'_, S> {
 struct Going<L: Lanes> {
     sheared: Sheared<L>,
     t_max: [f32; 16],
-    found: Found,
     /// Rays that want more.
     active: u32,
-    entry: [f32; 16],
 }
 
 /// Where a traversal begins: at the root, or with some triangles and subtrees, as children of nodes made for it.
