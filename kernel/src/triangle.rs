@@ -114,10 +114,34 @@ impl Axes {
     }
 }
 
-/// A ray as the triangle test wants it, one a lane, all with the same dominant axis.
+/// Which axes are x, y and z of the test: the same in all lanes, or by lane.
 #[derive(Clone, Copy, Debug)]
-pub(crate) struct Sheared<L> {
-    pub(crate) axes: Axes,
+pub(crate) enum Turn<L: Lanes> {
+    /// In all lanes.
+    Same(Axes),
+    /// Lanes whose dominant axis is the first, and the second; of the others it is the third.
+    Each([L::Mask; 2]),
+}
+
+impl<L: Lanes> Turn<L> {
+    /// The components of a vector along x, y and z.
+    #[inline(always)]
+    fn of(&self, [x, y, z]: Vec3x<L>) -> Vec3x<L> {
+        match *self {
+            Self::Same(axes) => [[x, y, z][axes.x], [x, y, z][axes.y], [x, y, z][axes.z]],
+            Self::Each([first, second]) => [
+                L::select(first, y, L::select(second, z, x)),
+                L::select(first, z, L::select(second, x, y)),
+                L::select(first, x, L::select(second, y, z)),
+            ],
+        }
+    }
+}
+
+/// A ray as the triangle test wants it, one a lane.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Sheared<L: Lanes> {
+    pub(crate) turn: Turn<L>,
     /// By world axis.
     pub(crate) origin: Vec3x<L>,
     /// By world axis.
@@ -139,31 +163,26 @@ pub(crate) struct Crossing<L: Lanes> {
 }
 
 impl<L: Lanes> Sheared<L> {
-    /// A ray, or one a lane. `direction` must be longest along `axes.z` in every lane that counts.
+    /// A ray, or one a lane. `direction` must be longest along z in every lane that counts.
     #[inline(always)]
     pub(crate) fn new(
         token: L::Token,
-        axes: Axes,
+        turn: Turn<L>,
         origin: Vec3x<L>,
         direction: Vec3x<L>,
         t_min: L,
         t_max: L,
     ) -> Self {
-        let step = L::splat(token, 1.0) / direction[axes.z];
-        let shear = [direction[axes.x] * step, direction[axes.y] * step, step];
-        Self { axes, origin, direction, shear, t_min, t_max }
+        let [x, y, z] = turn.of(direction);
+        let step = L::splat(token, 1.0) / z;
+        Self { turn, origin, direction, shear: [x * step, y * step, step], t_min, t_max }
     }
 
     /// A vertex with the ray's origin at 0 and the ray along z.
     #[inline(always)]
     fn vertex(&self, vertex: Vec3x<L>) -> Vec3x<L> {
-        let Axes { x, y, z } = self.axes;
-        let depth = vertex[z] - self.origin[z];
-        [
-            (vertex[x] - self.origin[x]) - self.shear[0] * depth,
-            (vertex[y] - self.origin[y]) - self.shear[1] * depth,
-            depth,
-        ]
+        let [x, y, depth] = self.turn.of(vec3x::sub(vertex, self.origin));
+        [x - self.shear[0] * depth, y - self.shear[1] * depth, depth]
     }
 
     /// Where these rays meet these triangles, lane by lane; either side may be splatted. NaN is a miss.
@@ -259,7 +278,7 @@ pub(crate) fn shear_one<S: Simd>(simd: S, ray: &crate::Ray, axis: usize) -> Shea
     let axes = Axes::of(axis);
     let step = 1.0 / ray.direction[axes.z];
     Sheared {
-        axes,
+        turn: Turn::Same(axes),
         origin: vec3x::splat(token, ray.origin.to_array()),
         direction: vec3x::splat(token, ray.direction.to_array()),
         shear: vec3x::splat(token, [ray.direction[axes.x] * step, ray.direction[axes.y] * step, step]),

@@ -5,7 +5,7 @@ use super::{Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::{Hit, RayPacket};
-use crate::triangle::{Axes, Found, Sheared, TriangleBlock};
+use crate::triangle::{Axes, Found, Sheared, TriangleBlock, Turn};
 use crate::vec3x::{self, Vec3x};
 use arrayvec::ArrayVec;
 use core::ops::ControlFlow;
@@ -192,7 +192,7 @@ impl Ends {
     #[inline(always)]
     fn sheared<L: Lanes>(&self, token: L::Token, axes: Axes, lane: usize, t_max: f32) -> Sheared<L> {
         Sheared {
-            axes,
+            turn: Turn::Same(axes),
             origin: vec3x::broadcast(token, &self.origin, lane),
             direction: vec3x::broadcast(token, &self.direction, lane),
             shear: vec3x::broadcast(token, &self.shear, lane),
@@ -314,7 +314,7 @@ impl<S: Simd> Bvh<'_, S> {
         self.traverse_rays(&Start::ROOT, &chunk, active, ignore, counter, visitor);
     }
 
-    /// Asks about the rays of `active`, those of one dominant axis at a time.
+    /// Asks about the rays of `active`.
     #[inline(always)]
     pub(super) fn traverse_rays<V: PacketVisitor<S::Packet>>(
         &self,
@@ -353,9 +353,23 @@ impl<S: Simd> Bvh<'_, S> {
         let shortest = S::Packet::splat(token, SHORTEST);
         let active = active & (finite & shortest.le(vec3x::most(length))).bits();
         // The rule of `Axes::dominant`.
-        let along_x = active & (y.le(x) & z.le(x)).bits();
-        let along_y = active & !along_x & z.le(y).bits();
+        let (first, second) = (y.le(x) & z.le(x), z.le(y));
+        let along_x = active & first.bits();
+        let along_y = active & !along_x & second.bits();
         let along_z = active & !along_x & !along_y;
+        let along = [along_x, along_y, along_z];
+        if active == 0 {
+            return;
+        }
+        let turn = if along_x == active {
+            Turn::Same(Axes::of(0))
+        } else if along_y == active {
+            Turn::Same(Axes::of(1))
+        } else if along_z == active {
+            Turn::Same(Axes::of(2))
+        } else {
+            Turn::Each([first, second])
+        };
 
         let slabs = if start.has_boxes() {
             let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
@@ -364,14 +378,7 @@ impl<S: Simd> Bvh<'_, S> {
         } else {
             PacketSlabs::nothing(token)
         };
-        let mut axis = 0;
-        while axis < 3 {
-            let active = [along_x, along_y, along_z][axis];
-            if active != 0 {
-                self.traverse_packet(start, rays, &slabs, Axes::of(axis), active, part, counter, visitor);
-            }
-            axis += 1;
-        }
+        self.traverse_packet(start, rays, &slabs, turn, along, part, counter, visitor);
     }
 
     #[allow(clippy::too_many_arguments)]
@@ -381,14 +388,15 @@ impl<S: Simd> Bvh<'_, S> {
         start: &Start<'_>,
         rays: &Rays<S::Packet>,
         slabs: &PacketSlabs<S::Packet>,
-        axes: Axes,
-        active: u32,
+        turn: Turn<S::Packet>,
+        along: [u32; 3],
         part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
         let token = self.simd.token();
-        let sheared = Sheared::new(token, axes, rays.origin, rays.direction, rays.t_min, rays.t_max);
+        let active = along[0] | along[1] | along[2];
+        let sheared = Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max);
         let mut this = Going { sheared, t_max: [0.0; 16], active };
         this.sheared.t_max.store(&mut this.t_max);
         // The child, the rays that meet its box, and where the first of them enters it.
@@ -433,7 +441,8 @@ impl<S: Simd> Bvh<'_, S> {
                     left &= left - 1;
                     let t_max = this.t_max[lane];
                     let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, lane, ends.t_min[lane]);
-                    let sheared = ends.sheared(token, axes, lane, t_max);
+                    let axis = usize::from(along[1] >> lane & 1 != 0) + 2 * usize::from(along[2] >> lane & 1 != 0);
+                    let sheared = ends.sheared(token, Axes::of(axis), lane, t_max);
                     if let Some(place) = self.blocker_of(next, &slabs, &sheared, t_max, part, counter) {
                         this.active &= !visitor.hits(
                             1 << lane,

@@ -23,7 +23,7 @@ use super::{Bvh, Child, Node, Part, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::Ray;
-use crate::triangle::{Axes, Found, Sheared, TriangleBlock, shear_one};
+use crate::triangle::{Axes, Found, Sheared, TriangleBlock, Turn, shear_one};
 use crate::vec3x;
 use arrayvec::ArrayVec;
 use glam::Vec3;
@@ -696,7 +696,7 @@ impl Pyramid {
         while axis < 3 {
             let asked = ask & (self.along[axis] >> i);
             if asked != 0 {
-                let sheared = Sheared::new(token, Axes::of(axis), origin, direction, begin, end);
+                let sheared = Sheared::new(token, Turn::Same(Axes::of(axis)), origin, direction, begin, end);
                 blocked |= u64::from(sheared.cross(token, triangle).hit.bits()) & asked;
             }
             axis += 1;
