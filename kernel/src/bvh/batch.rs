@@ -39,6 +39,12 @@ impl<'a> Targets<'a> {
         Self { plane: Some(plane), ..self }
     }
 
+    /// A corner and the edges at it of the light they lie on, if that is known.
+    #[inline(always)]
+    pub(super) fn plane(&self) -> Option<[Vec3; 3]> {
+        self.plane
+    }
+
     /// Three unit vectors at right angles, two of them in the light's plane if it is known.
     #[inline(always)]
     pub(super) fn turn(&self) -> [Vec3; 3] {
@@ -346,4 +352,30 @@ fn ends_of<S: Simd>(
     }
     tail[..count].copy_from_slice(&all[from..from + count]);
     S::Packet::load(token, tail)
+}
+
+/// Targets from the `i`th on, as many as a vector holds; the last one before `end` once more beyond it.
+#[inline(always)]
+pub(super) fn targets_from<S: Simd>(
+    token: S::Token,
+    targets: &Targets<'_>,
+    i: usize,
+    end: usize,
+) -> [S::Packet; 3] {
+    if i + S::Packet::WIDTH <= end {
+        return [
+            S::Packet::load(token, &targets.axis(0)[i..]),
+            S::Packet::load(token, &targets.axis(1)[i..]),
+            S::Packet::load(token, &targets.axis(2)[i..]),
+        ];
+    }
+    let mut lanes = [[0.0; 16]; 3];
+    let mut axis = 0;
+    while axis < 3 {
+        let all = &targets.axis(axis)[i..end];
+        lanes[axis] = [all[all.len() - 1]; 16];
+        lanes[axis][..all.len()].copy_from_slice(all);
+        axis += 1;
+    }
+    vec3x::load(token, &lanes, 0)
 }

@@ -18,7 +18,9 @@
 //! left to rounding: where a ray runs within a triangle's plane (to a millionth), `t` may be that of any point of
 //! the triangle, and a hit that rounding puts outside the box counts only if `t_min` and `t_max` let its box count.
 
+mod abreast;
 mod batch;
+mod cover;
 mod occluders;
 mod packet;
 mod part;

@@ -44,7 +44,7 @@ const EASY: u32 = 3;
 const LEAF_LONE: u32 = 3;
 
 /// Bounds on rounding are this many units of the textbook's first-order bounds.
-const CAUTION: f32 = 2.0;
+pub(super) const CAUTION: f32 = 2.0;
 
 /// Subtrees yet to visit: how deep each begins, and the targets it may hide.
 pub(super) type Stack = ArrayVec<(Child, f32, u64), STACK>;
@@ -119,20 +119,170 @@ impl Plane {
     }
 }
 
-/// Eight triangles as forms, by lane.
+/// Triangles as forms, by lane.
 pub(super) struct Forms {
-    /// The four forms' coefficients of s, t and 1.
-    edges: [[[f32; 8]; 3]; 3],
+    /// The forms' coefficients of s, t and 1.
+    pub(super) edges: [[[f32; 16]; 3]; 3],
     /// `|V|`: what the sum of the edges must reach at depth 1.
-    volume: [f32; 8],
+    pub(super) volume: [f32; 16],
     /// Above this a form is surely positive, below minus this surely negative.
-    edge_bound: [f32; 8],
-    depth_bound: [f32; 8],
+    pub(super) edge_bound: [f32; 16],
+    pub(super) depth_bound: [f32; 16],
 }
 
 impl Forms {
-    const NOTHING: Self =
-        Self { edges: [[[0.0; 8]; 3]; 3], volume: [0.0; 8], edge_bound: [0.0; 8], depth_bound: [0.0; 8] };
+    pub(super) const NOTHING: Self =
+        Self { edges: [[[0.0; 16]; 3]; 3], volume: [0.0; 16], edge_bound: [0.0; 16], depth_bound: [0.0; 16] };
+}
+
+/// The targets as seen from x, in the coordinates S, T and W: a triangle a lane, or a point a lane.
+pub(super) struct View<L> {
+    /// What S, T and W of a position may be off by.
+    pub(super) rounding: [L; 3],
+    /// Least and greatest S/W, then T/W, of the targets.
+    pub(super) sides: [L; 4],
+    /// Least and greatest W of the targets, and one over the least.
+    pub(super) depth: [L; 2],
+    pub(super) by_depth: L,
+    /// Least and greatest s, then t, that forms are asked for.
+    pub(super) rectangle: [L; 4],
+    /// What forms are to be multiplied by at least and at most to be those of the targets.
+    pub(super) scale: [L; 2],
+}
+
+/// Triangles as forms, and what is clear of them already.
+pub(super) struct Outline<L: Lanes> {
+    edges: [[L; 3]; 3],
+    volume: L,
+    bound: L,
+    depth_bound: L,
+    /// Large enough to be told from an edge.
+    pub(super) known: L::Mask,
+    /// If known, may block something.
+    pub(super) open: L::Mask,
+    /// If known, hides all directions.
+    pub(super) every: L::Mask,
+    /// If known, stands before every target.
+    pub(super) before: L::Mask,
+}
+
+/// How forms of S, T and W become forms of other coordinates, s and t: with (s + a, t + b, c) in their place; and what
+/// these three may be off by.
+pub(super) struct Shift<L> {
+    pub(super) to: [L; 3],
+    pub(super) error: [L; 3],
+}
+
+impl<L: Lanes> View<L> {
+    /// Triangles that have not all vertices behind one side of the pyramid, widened.
+    #[inline(always)]
+    pub(super) fn meets(&self, [a, b, c]: [[L; 3]; 3]) -> L::Mask {
+        let [ds, dt, dw] = self.rounding;
+        let [s0, s1, t0, t1] = self.sides;
+        let deepest = a[2].max(b[2]).max(c[2]);
+        let nearest = a[2].min(b[2]).min(c[2]);
+        let (far_s, far_t) = (s0.abs().max(s1.abs()), t0.abs().max(t1.abs()));
+        let (wide_s, wide_t) = (dw.mul_add(far_s, ds), dw.mul_add(far_t, dt));
+        let mut open = (-wide_s).le(beyond(a, s0, 0).max(beyond(b, s0, 0)).max(beyond(c, s0, 0)));
+        open = open & (-wide_s).le(short(a, s1, 0).max(short(b, s1, 0)).max(short(c, s1, 0)));
+        open = open & (-wide_t).le(beyond(a, t0, 1).max(beyond(b, t0, 1)).max(beyond(c, t0, 1)));
+        open = open & (-wide_t).le(short(a, t1, 1).max(short(b, t1, 1)).max(short(c, t1, 1)));
+        open & (-dw).le(deepest) & nearest.le(self.depth[1] + dw)
+    }
+
+    /// The forms of triangles.
+    #[inline(always)]
+    pub(super) fn outline(
+        &self,
+        token: L::Token,
+        [a, b, c]: [[L; 3]; 3],
+        shift: Option<&Shift<L>>,
+    ) -> Outline<L> {
+        let one = |value: f32| L::splat(token, value);
+        let zero = one(0.0);
+        let [ds, dt, dw] = self.rounding;
+        let [s0, s1, t0, t1] = self.sides;
+        let [w0, w1] = self.depth;
+        let (far_s, far_t) = (s0.abs().max(s1.abs()), t0.abs().max(t1.abs()));
+        let deepest = a[2].max(b[2]).max(c[2]);
+        let (ab, bc, ca) = (vec3x::cross(a, b), vec3x::cross(b, c), vec3x::cross(c, a));
+        let volume = ab[0] * c[0] + ab[1] * c[1] + ab[2] * c[2];
+
+        // First-order bounds: each component of a vertex off by its rounding, and the products by theirs.
+        let big_s = a[0].abs().max(b[0].abs()).max(c[0].abs());
+        let big_t = a[1].abs().max(b[1].abs()).max(c[1].abs());
+        let big_w = a[2].abs().max(b[2].abs()).max(c[2].abs());
+        let deep = one(1.0) + big_w * self.by_depth;
+        let bound = ds * (big_t * deep + far_t * big_w)
+            + dt * (big_s * deep + far_s * big_w)
+            + dw * (far_s * big_t + far_t * big_s);
+        let mut bound = bound * one(4.0);
+        let volume_bound = ds * big_t * big_w + dt * big_s * big_w + dw * big_s * big_t;
+        let volume_bound = volume_bound * one(6.0);
+        let sign = L::select(volume.lt(zero), one(-1.0), one(1.0));
+        let volume = volume.abs();
+
+        let (mut ab, mut bc, mut ca) = (scale(ab, sign), scale(bc, sign), scale(ca, sign));
+        if let Some(shift) = shift {
+            let mut k = 0;
+            while k < 3 {
+                let most = ab[k].abs().max(bc[k].abs()).max(ca[k].abs());
+                bound = bound + most * shift.error[k];
+                k += 1;
+            }
+            (ab[2], bc[2], ca[2]) = (shift.apply(ab), shift.apply(bc), shift.apply(ca));
+        }
+        // Each form over the rectangle: nowhere positive, or everywhere.
+        let [s0, s1, t0, t1] = self.rectangle;
+        let high = highest(ab, s0, s1, t0, t1).min(highest(bc, s0, s1, t0, t1));
+        let high = high.min(highest(ca, s0, s1, t0, t1));
+        let low = lowest(ab, s0, s1, t0, t1).min(lowest(bc, s0, s1, t0, t1));
+        let low = low.min(lowest(ca, s0, s1, t0, t1));
+        let every = bound.lt(low);
+        // Beyond every target, or before all of them.
+        let sum = [ab[0] + bc[0] + ca[0], ab[1] + bc[1] + ca[1], ab[2] + bc[2] + ca[2]];
+        let depth_bound = volume_bound + bound * one(3.0) * w1;
+        let (low_sum, high_sum) = (lowest(sum, s0, s1, t0, t1), highest(sum, s0, s1, t0, t1));
+        let [m0, m1] = self.scale;
+        let reached = volume.le((high_sum * m1).max(high_sum * m0) + depth_bound);
+        let before = (volume + depth_bound).lt((low_sum * m0).min(low_sum * m1)) | deepest.lt(w0 * one(0.5));
+        Outline {
+            edges: [ab, bc, ca],
+            volume,
+            bound,
+            depth_bound,
+            known: volume_bound.lt(volume),
+            open: (-bound).le(high) & reached,
+            every,
+            before,
+        }
+    }
+}
+
+impl<L: Lanes> Shift<L> {
+    #[inline(always)]
+    fn apply(&self, e: [L; 3]) -> L {
+        e[0].mul_add(self.to[0], e[1].mul_add(self.to[1], e[2] * self.to[2]))
+    }
+}
+
+impl<L: Lanes> Outline<L> {
+    /// Writes the forms of lanes from the `from`th on.
+    #[inline(always)]
+    pub(super) fn store(&self, forms: &mut Forms, from: usize) {
+        let mut edge = 0;
+        while edge < 3 {
+            let mut k = 0;
+            while k < 3 {
+                self.edges[edge][k].store(&mut forms.edges[edge][k][from..]);
+                k += 1;
+            }
+            edge += 1;
+        }
+        self.volume.store(&mut forms.volume[from..]);
+        self.bound.store(&mut forms.edge_bound[from..]);
+        self.depth_bound.store(&mut forms.depth_bound[from..]);
+    }
 }
 
 /// What the set-up says of the triangles of a block.
@@ -487,7 +637,6 @@ impl Pyramid {
     ) {
         type N<S> = <S as Simd>::Node;
         let one = |value: f32| N::<S>::splat(token, value);
-        let zero = one(0.0);
         let x = vec3x::splat::<N<S>>(token, self.x.to_array());
         // Positions from x: the same differences, with the same rounding, as in the exact test.
         let a = vec3x::sub(vec3x::load(token, &block.vertices[0], from), x);
@@ -497,21 +646,18 @@ impl Pyramid {
         let a = self.project(simd, a);
         let b = self.project(simd, b);
         let c = self.project(simd, c);
-
-        // A side of the pyramid, widened, with all three vertices behind it.
-        let [ds, dt, dw] = [one(self.rounding.x), one(self.rounding.y), one(self.rounding.z)];
-        let deepest = a[2].max(b[2]).max(c[2]);
-        let nearest = a[2].min(b[2]).min(c[2]);
-        let (s0, s1) = (one(self.least.x), one(self.greatest.x));
-        let (t0, t1) = (one(self.least.y), one(self.greatest.y));
         let (w0, w1) = (one(self.least.z), one(self.greatest.z));
-        let (far_s, far_t) = (s0.abs().max(s1.abs()), t0.abs().max(t1.abs()));
-        let (wide_s, wide_t) = (dw.mul_add(far_s, ds), dw.mul_add(far_t, dt));
-        let mut open = (-wide_s).le(beyond(a, s0, 0).max(beyond(b, s0, 0)).max(beyond(c, s0, 0)));
-        open = open & (-wide_s).le(short(a, s1, 0).max(short(b, s1, 0)).max(short(c, s1, 0)));
-        open = open & (-wide_t).le(beyond(a, t0, 1).max(beyond(b, t0, 1)).max(beyond(c, t0, 1)));
-        open = open & (-wide_t).le(short(a, t1, 1).max(short(b, t1, 1)).max(short(c, t1, 1)));
-        open = open & (-dw).le(deepest) & nearest.le(w1 + dw);
+        let rectangle =
+            [one(self.least.x), one(self.greatest.x), one(self.least.y), one(self.greatest.y)];
+        let view = View {
+            rounding: [one(self.rounding.x), one(self.rounding.y), one(self.rounding.z)],
+            sides: rectangle,
+            depth: [w0, w1],
+            by_depth: one(1.0 / self.least.z),
+            rectangle,
+            scale: [w0, w1],
+        };
+        let mut open = view.meets([a, b, c]);
         if !open.any() {
             return;
         }
@@ -523,59 +669,18 @@ impl Pyramid {
         if left == 0 {
             return;
         }
-
-        let (ab, bc, ca) = (vec3x::cross(a, b), vec3x::cross(b, c), vec3x::cross(c, a));
-        let volume = ab[0] * c[0] + ab[1] * c[1] + ab[2] * c[2];
-
-        // First-order bounds: each component of a vertex off by its rounding, and the products by theirs.
-        let big_s = a[0].abs().max(b[0].abs()).max(c[0].abs());
-        let big_t = a[1].abs().max(b[1].abs()).max(c[1].abs());
-        let big_w = a[2].abs().max(b[2].abs()).max(c[2].abs());
-        let deep = one(1.0) + big_w * one(1.0 / self.least.z);
-        let bound = ds * (big_t * deep + far_t * big_w)
-            + dt * (big_s * deep + far_s * big_w)
-            + dw * (far_s * big_t + far_t * big_s);
-        let bound = bound * one(4.0);
-        let volume_bound = ds * big_t * big_w + dt * big_s * big_w + dw * big_s * big_t;
-        let volume_bound = volume_bound * one(6.0);
-        let sign = N::<S>::select(volume.lt(zero), one(-1.0), one(1.0));
-        let volume = volume.abs();
-
-        // Each form over the rectangle: nowhere positive, or everywhere.
-        let (ab, bc, ca) = (scale(ab, sign), scale(bc, sign), scale(ca, sign));
-        let high = highest(ab, s0, s1, t0, t1).min(highest(bc, s0, s1, t0, t1));
-        let high = high.min(highest(ca, s0, s1, t0, t1));
-        let low = lowest(ab, s0, s1, t0, t1).min(lowest(bc, s0, s1, t0, t1));
-        let low = low.min(lowest(ca, s0, s1, t0, t1));
-        let some = (-bound).le(high);
-        let every = bound.lt(low);
-        // Beyond every target, or before all of them.
-        let sum = [ab[0] + bc[0] + ca[0], ab[1] + bc[1] + ca[1], ab[2] + bc[2] + ca[2]];
-        let depth_bound = volume_bound + bound * one(3.0) * w1;
-        let (low_sum, high_sum) = (lowest(sum, s0, s1, t0, t1), highest(sum, s0, s1, t0, t1));
-        let reached = volume.le((high_sum * w1).max(high_sum * w0) + depth_bound);
-        let before = (volume + depth_bound).lt((low_sum * w0).min(low_sum * w1)) | deepest.lt(w0 * one(0.5));
-
-        let known = volume_bound.lt(volume).bits();
-        left &= !known | (some & reached).bits();
+        let outline = view.outline(token, [a, b, c], None);
+        let known = outline.known.bits();
+        left &= !known | outline.open.bits();
         if left == 0 {
             return;
         }
-        let before = before.bits() & known;
+        let before = outline.before.bits() & known;
         verdict.open |= left << from;
-        verdict.all |= (left & before & every.bits()) << from;
+        verdict.all |= (left & before & outline.every.bits()) << from;
         verdict.unclear |= (left & !known) << from;
         verdict.deep |= (left & !before) << from;
-        let mut k = 0;
-        while k < 3 {
-            ab[k].store(&mut forms.edges[0][k][from..]);
-            bc[k].store(&mut forms.edges[1][k][from..]);
-            ca[k].store(&mut forms.edges[2][k][from..]);
-            k += 1;
-        }
-        volume.store(&mut forms.volume[from..]);
-        bound.store(&mut forms.edge_bound[from..]);
-        depth_bound.store(&mut forms.depth_bound[from..]);
+        outline.store(forms, from);
     }
 
     /// Triangles, by their vertices from x, whose planes may pass between x and a target.
@@ -757,6 +862,20 @@ pub(super) fn least_of<L: Lanes>(v: L) -> f32 {
         i += 1;
     }
     least
+}
+
+/// NaN if any lane is.
+#[inline(always)]
+pub(super) fn sum_of<L: Lanes>(v: L) -> f32 {
+    let mut lanes = [0.0; 16];
+    v.store(&mut lanes);
+    let mut sum = 0.0;
+    let mut i = 0;
+    while i < L::WIDTH {
+        sum += lanes[i];
+        i += 1;
+    }
+    sum
 }
 
 #[inline(always)]

@@ -18,8 +18,8 @@ use glam::Vec3;
 /// A box turned any way, from a reference point: its middle and its half axes.
 #[derive(Clone, Copy, Debug)]
 pub(super) struct Turned {
-    middle: Vec3,
-    axes: [Vec3; 3],
+    pub(super) middle: Vec3,
+    pub(super) axes: [Vec3; 3],
 }
 
 /// Grows around positions, in a frame of three unit vectors.
@@ -27,13 +27,15 @@ pub(super) struct Around<L> {
     frame: [Vec3; 3],
     low: [L; 3],
     high: [L; 3],
+    /// 0 as long as all positions are finite.
+    odd: L,
 }
 
 impl<L: Lanes> Around<L> {
     #[inline(always)]
     pub(super) fn new(token: L::Token, frame: [Vec3; 3]) -> Self {
         let (low, high) = (L::splat(token, f32::INFINITY), L::splat(token, f32::NEG_INFINITY));
-        Self { frame, low: [low; 3], high: [high; 3] }
+        Self { frame, low: [low; 3], high: [high; 3], odd: L::splat(token, 0.0) }
     }
 
     /// Takes in as many positions as there are lanes.
@@ -45,6 +47,7 @@ impl<L: Lanes> Around<L> {
             let at = position[0].mul_add(x, position[1].mul_add(y, position[2] * z));
             self.low[k] = self.low[k].min(at);
             self.high[k] = self.high[k].max(at);
+            self.odd = self.odd + (at - at);
             k += 1;
         }
     }
@@ -54,8 +57,9 @@ impl<L: Lanes> Around<L> {
         let mut turned = Turned { middle: Vec3::ZERO, axes: [Vec3::ZERO; 3] };
         let mut k = 0;
         while k < 3 {
-            let (low, high) =
-                (super::pyramid::least_of(self.low[k]), super::pyramid::greatest_of(self.high[k]));
+            let odd = super::pyramid::sum_of(self.odd);
+            let low = super::pyramid::least_of(self.low[k]) + odd;
+            let high = super::pyramid::greatest_of(self.high[k]) + odd;
             turned.middle += self.frame[k] * (0.5 * (low + high));
             turned.axes[k] = self.frame[k] * (0.5 * (high - low));
             k += 1;
@@ -74,9 +78,15 @@ impl Turned {
             + if index & 4 == 0 { c } else { -c }
     }
 
+    /// The greatest of a linear function over the box.
+    #[inline(always)]
+    pub(super) fn most(&self, normal: Vec3) -> f32 {
+        -self.least(-normal)
+    }
+
     /// The least of a linear function over the box.
     #[inline(always)]
-    fn least(&self, normal: Vec3) -> f32 {
+    pub(super) fn least(&self, normal: Vec3) -> f32 {
         let [a, b, c] = self.axes;
         normal.dot(self.middle) - normal.dot(a).abs() - normal.dot(b).abs() - normal.dot(c).abs()
     }
@@ -99,6 +109,9 @@ pub(super) struct Shaft {
     pub(super) reference: Vec3,
     /// From the middle of the points to that of the targets.
     pub(super) between: Vec3,
+    /// The boxes themselves, from the reference.
+    pub(super) points: Turned,
+    pub(super) targets: Turned,
     planes: [Plane; PLANES],
     lower: Vec3,
     upper: Vec3,
@@ -177,7 +190,7 @@ impl Shaft {
         // Positions are rounded when they are counted from the reference, and again when the result is moved back.
         let slack = Vec3::splat(4.0 * position);
         let (lower, upper) = (reference + lower - slack, reference + upper + slack);
-        Some(Self { reference, between, planes, lower, upper, corners, farthest })
+        Some(Self { reference, between, points: *points, targets: *targets, planes, lower, upper, corners, farthest })
     }
 
     /// Both boxes are on the positive side. A normal of next to no length culls nothing.

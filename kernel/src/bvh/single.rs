@@ -247,6 +247,18 @@ impl<S: Simd> Bvh<'_, S> {
         self.traverse_in_no_order(subtree, slabs, sheared, part, counter, &mut First { t_max, found: None })
     }
 
+    /// Where a triangle stands that blocks a ray, if any does.
+    #[inline(always)]
+    pub(super) fn blocker_place(&self, ray: &Ray, part: impl Part, counter: &mut impl Counter) -> Option<Place> {
+        let axis = dominant_axis(ray.origin, ray.direction)?;
+        if ray.direction.abs().max_element() < SHORTEST {
+            return None;
+        }
+        let slabs = Slabs::<S::Node>::new(self.simd.token(), ray, self.slack(ray.origin));
+        let sheared = shear_one(self.simd, ray, axis);
+        self.blocker_of(Child::node(0), &slabs, &sheared, ray.t_max, part, counter)
+    }
+
     #[inline(always)]
     fn traverse_below<V: Visitor>(
         &self,

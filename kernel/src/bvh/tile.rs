@@ -5,11 +5,13 @@
 //! many, the subtrees to begin with. Each point then starts from these and not from the root; and the triangles
 //! that blocked anything for one point are asked first for the next.
 
-use super::batch::{BatchScratch, FEW};
+use super::abreast::{Abreast, Flat};
+use super::batch::{BatchScratch, FEW, targets_from};
 use super::occluders::Walls;
 use super::packet::{Any, Nobody, Rays, Start};
 use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft};
+use super::single::Place;
 use super::{Bvh, CUT, Child, Node, Occluders, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
@@ -29,13 +31,16 @@ pub struct TilePoint {
     pub count: u32,
 }
 
-/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About twenty kilobytes.
+/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About forty kilobytes.
 pub struct TileScratch {
     batch: BatchScratch,
     cut: Cut,
     given: List,
     learned: List,
     packet: Packet,
+    abreast: Abreast,
+    /// Where the last sheet that hid a whole light was grown from.
+    sheet: Option<Place>,
 }
 
 impl TileScratch {
@@ -47,6 +52,8 @@ impl TileScratch {
             given: List::EMPTY,
             learned: List::EMPTY,
             packet: Packet::EMPTY,
+            abreast: Abreast::NOTHING,
+            sheet: None,
         }
     }
 }
@@ -300,7 +307,7 @@ impl<S: Simd> Bvh<'_, S> {
             }
             return;
         }
-        let TileScratch { batch, cut, given, learned, packet } = scratch;
+        let TileScratch { batch, cut, given, learned, packet, abreast, sheet } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
             Some(shaft) => self.gather(shaft, rays, points.len(), cut, given, counter),
@@ -314,8 +321,49 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         packet.count = 0;
+        if let Some(shaft) = &shaft
+            && self.sheet_between(shaft, if complete { Some(given) } else { None }, sheet, ignore, counter)
+        {
+            counter.rays(rays as u32);
+            let mut k = 0;
+            while k < points.len() {
+                let (first, end) = run(points, &mut k);
+                fill(blocked, first, end - first);
+            }
+            return;
+        }
+        let flat = match &shaft {
+            Some(shaft) if complete && rays >= FEW * points.len() => {
+                Flat::new(targets, shaft, self.magnitude)
+            }
+            _ => None,
+        };
+        // Points that were answered abreast, and the first that was not asked.
+        let (mut answered, mut next) = (0u32, 0);
         let mut k = 0;
         while k < points.len() {
+            if let Some(flat) = &flat {
+                if k == next {
+                    next = (k + S::Packet::WIDTH).min(points.len());
+                    let list = given.blocks();
+                    answered = self.ask_abreast(flat, &points[k..next], targets, list, ignore, counter, abreast);
+                    let mut lane = 0;
+                    while k + lane < next {
+                        let TilePoint { first, count, .. } = points[k + lane];
+                        if answered >> lane & 1 != 0 {
+                            counter.rays(count);
+                            set(blocked, first as usize, abreast.blocked[lane]);
+                        }
+                        lane += 1;
+                    }
+                }
+                let this = answered & 1 != 0;
+                answered >>= 1;
+                if this {
+                    k += 1;
+                    continue;
+                }
+            }
             let TilePoint { x, first, count } = points[k];
             let (mut from, end) = (first as usize, (first + count) as usize);
             while from < end {
@@ -509,23 +557,7 @@ impl<S: Simd> Bvh<'_, S> {
             let origin = vec3x::splat::<P<S>>(token, reference.to_array());
             let mut i = first;
             while i < end {
-                let position = if i + P::<S>::WIDTH <= end {
-                    [
-                        P::<S>::load(token, &targets.axis(0)[i..]),
-                        P::<S>::load(token, &targets.axis(1)[i..]),
-                        P::<S>::load(token, &targets.axis(2)[i..]),
-                    ]
-                } else {
-                    let mut lanes = [[0.0; 16]; 3];
-                    let mut axis = 0;
-                    while axis < 3 {
-                        let all = &targets.axis(axis)[i..end];
-                        lanes[axis] = [all[all.len() - 1]; 16];
-                        lanes[axis][..all.len()].copy_from_slice(all);
-                        axis += 1;
-                    }
-                    vec3x::load(token, &lanes, 0)
-                };
+                let position = targets_from::<S>(token, targets, i, end);
                 there.add(token, vec3x::sub(position, origin));
                 i += P::<S>::WIDTH;
             }
@@ -539,6 +571,37 @@ impl<S: Simd> Bvh<'_, S> {
         cut.count = 0;
         let most = self.magnitude;
         cut.push(&Entry { child: Child::node(0), bounds: [[-most; 3], [most; 3]] });
+    }
+
+    /// Does a sheet of triangles stand between all points and all targets of a shaft? `list` is all that the shaft
+    /// meets, if that is known.
+    #[inline(always)]
+    fn sheet_between(
+        &self,
+        shaft: &Shaft,
+        list: Option<&List>,
+        sheet: &mut Option<Place>,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+    ) -> bool {
+        if let Some(list) = list {
+            return match self.met_in_the_middle(shaft, list.blocks(), counter) {
+                Some((block, lane)) => self.sheet_hides(shaft, block, lane, ignore, counter),
+                None => false,
+            };
+        }
+        if let Some(place) = *sheet
+            && let Some(block) = self.blocks.get(place.block)
+            && self.sheet_hides(shaft, block, place.lane, ignore, counter)
+        {
+            return true;
+        }
+        let Some(place) = self.blocker_place(&shaft.axis(), ignore, counter) else { return false };
+        let hides = self.sheet_hides(shaft, &self.blocks[place.block], place.lane, ignore, counter);
+        if hides {
+            *sheet = Some(place);
+        }
+        hides
     }
 
     /// Goes down the tree with the shaft. True if the list holds all that may block anything; else what is not
