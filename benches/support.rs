@@ -3,7 +3,7 @@
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::error::Result;
-use occlude_host::film::Tile;
+use occlude_host::film::{Tile, z_order};
 use occlude_host::generate::{Kind, generate};
 use occlude_host::light::{AreaLight, lights};
 use occlude_host::sampler::{Pattern, Sampler};
@@ -278,8 +278,12 @@ impl Task for FirstHits<'_> {
                 let (x, y) = tile.position(*pixel);
                 2 * ((y - tile.y) / (TILE / 2)) + (x - tile.x) / (TILE / 2)
             };
+            // Along a Z curve, so that neighbours in the list are neighbours in the picture.
             let mut pixels: Vec<usize> = (0..tile.len()).collect();
-            pixels.sort_by_key(quarter);
+            pixels.sort_by_key(|&pixel| {
+                let (x, y) = tile.position(pixel);
+                z_order(x - tile.x, y - tile.y)
+            });
             for pixel in pixels {
                 let (px, py) = tile.position(pixel);
                 let toward = frame.ray_direction(px as f32 + 0.5, py as f32 + 0.5);

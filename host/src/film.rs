@@ -51,6 +51,26 @@ impl Tile {
     }
 }
 
+/// Where a pixel comes along a Z curve (Morton 1966): neighbours on the curve are neighbours in the picture.
+pub fn z_order(x: u32, y: u32) -> u64 {
+    let spread = |v: u32| {
+        let mut v = u64::from(v);
+        for shift in [16, 8, 4, 2, 1] {
+            v = (v | v << shift) & MASKS[usize::ilog2(shift) as usize];
+        }
+        v
+    };
+    /// Every second bit, pair of bits, and so on.
+    const MASKS: [u64; 5] = [
+        0x5555_5555_5555_5555,
+        0x3333_3333_3333_3333,
+        0x0f0f_0f0f_0f0f_0f0f,
+        0x00ff_00ff_00ff_00ff,
+        0x0000_ffff_0000_ffff,
+    ];
+    spread(x) | spread(y) << 1
+}
+
 /// Mean and summed squared deviation of one pixel.
 ///
 /// Welford, "Note on a Method for Calculating Corrected Sums of Squares and Products", Technometrics 4(3), 1962.

@@ -192,8 +192,14 @@ impl<L: Lanes> Sheared<L> {
         let u = c[0] * b[1] - c[1] * b[0];
         let v = a[0] * c[1] - a[1] * c[0];
         let w = b[0] * a[1] - b[1] * a[0];
-        let det = u + v + w;
         let zero = L::splat(token, 0.0);
+        // With a sign of each kind a lane is outside, which is what most are; NaN and zeros are looked at below.
+        let (least, most) = (u.min(v).min(w), u.max(v).max(w));
+        let outside = least.lt(zero) & zero.lt(most);
+        let det = u + v + w;
+        if outside.bits() == u32::MAX >> (32 - L::WIDTH) {
+            return Crossing { hit: zero.lt(zero), det, t: zero, u: v, v: w };
+        }
         let front = zero.le(u) & zero.le(v) & zero.le(w) & zero.lt(det);
         let back = u.le(zero) & v.le(zero) & w.le(zero) & det.lt(zero);
         let inside = front | back;

@@ -1,6 +1,7 @@
 //! Every shadow ray traced: the answers are right, one by one.
 
 use super::{Questions, Stage, Visibility};
+use crate::film::z_order;
 use crate::light::AreaLight;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::{Bvh, Counter, Counts, Occluders, Simd, Targets, TilePoint, TileScratch, Uncounted};
@@ -89,24 +90,24 @@ struct Group {
     points: Vec<TilePoint>,
 }
 
-/// With as many samples a point and light or more, a tile is cut into parts of [`PART`] pixels: narrow shafts then
-/// save more than they cost.
+/// With as many samples a point and light or more, a tile is cut into parts of [`PART`] pixels along its Z curve, 8 by 8:
+/// narrow shafts then save more than they cost.
 const FEW: usize = 4;
-const PART: u32 = 8;
+const PART: u64 = 64;
 
-/// The batches of a tile by light and by part of the tile.
+/// The batches of a tile by light and by part of the tile, those of neighbours one after the other.
 fn groups(questions: &Questions) -> Vec<Group> {
     let Questions { points, batches, width, .. } = questions;
     let whole = questions.weights.len() < FEW * batches.len();
-    let part = |pixel: u32| {
-        let (x, y) = (pixel % width.max(&1), pixel / width.max(&1));
-        if whole { 0 } else { ((y / PART) << 16) | (x / PART) }
+    let place = |batch: &super::Batch| {
+        let pixel = points[batch.point as usize].pixel;
+        (batch.light, z_order(pixel % width.max(&1), pixel / width.max(&1)))
     };
-    let place = |batch: &super::Batch| (batch.light, part(points[batch.point as usize].pixel));
+    let part = |(light, place): (u32, u64)| (light, if whole { 0 } else { place / PART });
     let mut order: Vec<_> = batches.iter().map(|batch| (place(batch), batch)).collect();
     order.sort_by_key(|&(place, _)| place);
     order
-        .chunk_by(|a, b| a.0 == b.0)
+        .chunk_by(|a, b| part(a.0) == part(b.0))
         .map(|group| Group {
             light: group[0].0.0,
             points: group

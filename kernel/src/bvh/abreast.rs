@@ -319,11 +319,8 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
     let by_height = one(1.0) / height;
     let (c_size, n_most) = (vec3x::abs(c), flat.normal.abs().max_element());
     let clear = (vec3x::most(c_size) * one(1e-3 * n_most)).lt(height.abs());
-    let rows = [
-        times(vec3x::cross(v, c), by_height),
-        times(vec3x::cross(c, u), by_height),
-        times(n, by_height),
-    ];
+    let rows =
+        [times(vec3x::cross(v, c), by_height), times(vec3x::cross(c, u), by_height), times(n, by_height)];
     // Off the light's plane.
     let middle = one(0.5 * (flat.least[2] + flat.greatest[2]));
     let half = one(0.5 * (flat.greatest[2] - flat.least[2]));
@@ -362,22 +359,17 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
         sides,
         depth: [depth - wide[2], depth + wide[2]],
         by_depth: by_depth * one(1.05),
-        rectangle: [
-            one(flat.least[0]),
-            one(flat.greatest[0]),
-            one(flat.least[1]),
-            one(flat.greatest[1]),
-        ],
+        rectangle: [one(flat.least[0]), one(flat.greatest[0]), one(flat.least[1]), one(flat.greatest[1])],
         scale: [one(1.0), one(1.0)],
     };
-    let plane = [
-        n[0].mul_add(middle, c[0]),
-        n[1].mul_add(middle, c[1]),
-        n[2].mul_add(middle, c[2]),
-    ];
+    let plane = [n[0].mul_add(middle, c[0]), n[1].mul_add(middle, c[1]), n[2].mul_add(middle, c[2])];
     let [s0, s1, t0, t1] = view.rectangle;
-    let corners =
-        [away(plane, u, s0, v, t0), away(plane, u, s1, v, t0), away(plane, u, s0, v, t1), away(plane, u, s1, v, t1)];
+    let corners = [
+        away(plane, u, s0, v, t0),
+        away(plane, u, s1, v, t0),
+        away(plane, u, s0, v, t1),
+        away(plane, u, s1, v, t1),
+    ];
     (Views { x, rows, view, shift: Shift { to, error }, corners }, clear.bits())
 }
 

@@ -71,7 +71,8 @@ impl<'s, L: Lanes> Sides<'s, L> {
             let p = self.corners[k];
             let n = vec3x::cross(vec3x::sub(a, p), vec3x::sub(b, p));
             let at = vec3x::dot(n, vec3x::sub(middle, p)) * sign;
-            let spread = vec3x::dot(n, axes[0]).abs() + vec3x::dot(n, axes[1]).abs() + vec3x::dot(n, axes[2]).abs();
+            let spread =
+                vec3x::dot(n, axes[0]).abs() + vec3x::dot(n, axes[1]).abs() + vec3x::dot(n, axes[2]).abs();
             // Written so that NaN fails.
             if (margin + spread).lt(at).bits() != every::<L>() {
                 return false;
@@ -204,12 +205,7 @@ impl Shaft {
     /// From the middle of the points to that of the targets.
     #[inline(always)]
     pub(super) fn axis(&self) -> Ray {
-        Ray {
-            origin: self.reference + self.points.middle,
-            direction: self.between,
-            t_min: 0.0,
-            t_max: 1.0,
-        }
+        Ray { origin: self.reference + self.points.middle, direction: self.between, t_min: 0.0, t_max: 1.0 }
     }
 }
 

@@ -441,7 +441,8 @@ impl<S: Simd> Bvh<'_, S> {
                     left &= left - 1;
                     let t_max = this.t_max[lane];
                     let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, lane, ends.t_min[lane]);
-                    let axis = usize::from(along[1] >> lane & 1 != 0) + 2 * usize::from(along[2] >> lane & 1 != 0);
+                    let axis =
+                        usize::from(along[1] >> lane & 1 != 0) + 2 * usize::from(along[2] >> lane & 1 != 0);
                     let sheared = ends.sheared(token, Axes::of(axis), lane, t_max);
                     if let Some(place) = self.blocker_of(next, &slabs, &sheared, t_max, part, counter) {
                         this.active &= !visitor.hits(

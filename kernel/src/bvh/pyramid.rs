@@ -647,8 +647,7 @@ impl Pyramid {
         let b = self.project(simd, b);
         let c = self.project(simd, c);
         let (w0, w1) = (one(self.least.z), one(self.greatest.z));
-        let rectangle =
-            [one(self.least.x), one(self.greatest.x), one(self.least.y), one(self.greatest.y)];
+        let rectangle = [one(self.least.x), one(self.greatest.x), one(self.least.y), one(self.greatest.y)];
         let view = View {
             rounding: [one(self.rounding.x), one(self.rounding.y), one(self.rounding.z)],
             sides: rectangle,

@@ -190,7 +190,17 @@ impl Shaft {
         // Positions are rounded when they are counted from the reference, and again when the result is moved back.
         let slack = Vec3::splat(4.0 * position);
         let (lower, upper) = (reference + lower - slack, reference + upper + slack);
-        Some(Self { reference, between, points: *points, targets: *targets, planes, lower, upper, corners, farthest })
+        Some(Self {
+            reference,
+            between,
+            points: *points,
+            targets: *targets,
+            planes,
+            lower,
+            upper,
+            corners,
+            farthest,
+        })
     }
 
     /// Both boxes are on the positive side. A normal of next to no length culls nothing.

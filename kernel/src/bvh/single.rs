@@ -249,7 +249,12 @@ impl<S: Simd> Bvh<'_, S> {
 
     /// Where a triangle stands that blocks a ray, if any does.
     #[inline(always)]
-    pub(super) fn blocker_place(&self, ray: &Ray, part: impl Part, counter: &mut impl Counter) -> Option<Place> {
+    pub(super) fn blocker_place(
+        &self,
+        ray: &Ray,
+        part: impl Part,
+        counter: &mut impl Counter,
+    ) -> Option<Place> {
         let axis = dominant_axis(ray.origin, ray.direction)?;
         if ray.direction.abs().max_element() < SHORTEST {
             return None;

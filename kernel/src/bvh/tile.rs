@@ -10,7 +10,7 @@ use super::batch::{BatchScratch, FEW, targets_from};
 use super::occluders::Walls;
 use super::packet::{Any, Nobody, Rays, Start};
 use super::pyramid::{Forgetful, Going, Learner, MOST};
-use super::shaft::{Around, Shaft};
+use super::shaft::{Around, Shaft, Turned};
 use super::single::Place;
 use super::{Bvh, CUT, Child, Node, Occluders, Targets};
 use crate::counter::Counter;
@@ -31,7 +31,7 @@ pub struct TilePoint {
     pub count: u32,
 }
 
-/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About forty kilobytes.
+/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About fifty kilobytes.
 pub struct TileScratch {
     batch: BatchScratch,
     cut: Cut,
@@ -39,6 +39,8 @@ pub struct TileScratch {
     learned: List,
     packet: Packet,
     abreast: Abreast,
+    inner_cut: Cut,
+    inner: List,
     /// Where the last sheet that hid a whole light was grown from.
     sheet: Option<Place>,
 }
@@ -53,6 +55,8 @@ impl TileScratch {
             learned: List::EMPTY,
             packet: Packet::EMPTY,
             abreast: Abreast::NOTHING,
+            inner_cut: Cut::NOTHING,
+            inner: List::EMPTY,
             sheet: None,
         }
     }
@@ -239,6 +243,26 @@ const MIXED: usize = 12;
 /// With fewer rays a shaft costs more than it saves.
 const WORTHWHILE: usize = 32;
 
+/// Tiles with as many samples a point and more points than a part has are asked about part by part, unless the list is
+/// short.
+const PARTED: usize = 8;
+const PART: usize = 16;
+const SHORT: usize = 12;
+
+/// With as many samples a point, also where there is more in the way than fits a list; so many parts must gain something
+/// for the others to be tried.
+const FINE: usize = 32;
+const TRIED: usize = 2;
+
+/// What points are asked with.
+struct Work<'w> {
+    batch: &'w mut BatchScratch,
+    learned: &'w mut List,
+    packet: &'w mut Packet,
+    abreast: &'w mut Abreast,
+    walls: &'w mut Walls,
+}
+
 /// Steps a shaft may take for each ray of its tile, and at most.
 const STEPS: [usize; 3] = [16, 8, 192];
 
@@ -293,24 +317,20 @@ impl<S: Simd> Bvh<'_, S> {
             counter.rays(rays as u32);
             return;
         }
-        let shaft =
-            if rays < WORTHWHILE { None } else { self.shaft(points, targets, frame_of_points(points)) };
+        let wanted = rays >= WORTHWHILE;
+        let shaft = if wanted { self.shaft(points, targets, frame_of_points(points)) } else { None };
         let mut walls = Walls::NONE;
         if let (Some(shaft), false, None) = (&shaft, occluders.is_empty(), ignore)
             && self.walled_off(occluders, shaft, &mut walls, counter)
         {
             counter.rays(rays as u32);
-            let mut k = 0;
-            while k < points.len() {
-                let (first, end) = run(points, &mut k);
-                fill(blocked, first, end - first);
-            }
+            fill_all(blocked, points);
             return;
         }
-        let TileScratch { batch, cut, given, learned, packet, abreast, sheet } = scratch;
+        let TileScratch { batch, cut, given, learned, packet, abreast, inner_cut, inner, sheet } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
-            Some(shaft) => self.gather(shaft, rays, points.len(), cut, given, counter),
+            Some(shaft) => self.gather(shaft, &self.nodes[..1], rays, points.len(), cut, given, counter),
             None => {
                 self.whole(cut);
                 false
@@ -325,15 +345,109 @@ impl<S: Simd> Bvh<'_, S> {
             && self.sheet_between(shaft, if complete { Some(given) } else { None }, sheet, ignore, counter)
         {
             counter.rays(rays as u32);
-            let mut k = 0;
-            while k < points.len() {
-                let (first, end) = run(points, &mut k);
-                fill(blocked, first, end - first);
-            }
+            fill_all(blocked, points);
             return;
         }
-        let flat = match &shaft {
-            Some(shaft) if complete && rays >= FEW * points.len() => {
+        let unwalled = walls.is_empty();
+        let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls };
+        let least = if complete { PARTED } else { FINE };
+        let apart = rays >= least * points.len()
+            && points.len() > PART
+            && unwalled
+            && !(complete && given.count <= SHORT);
+        let Some(whole) = shaft.as_ref().filter(|_| apart) else {
+            let shaft = shaft.as_ref();
+            self.ask_points(shaft, complete, points, targets, cut, given, ignore, counter, work, blocked);
+            return;
+        };
+        // Neighbours among the neighbours have narrower shafts.
+        let (mut useful, mut tried) = (0, 0);
+        let mut k = 0;
+        while k < points.len() {
+            if !complete && tried == TRIED && useful == 0 {
+                let rest = &points[k..];
+                self.ask_points(None, false, rest, targets, cut, given, ignore, counter, work, blocked);
+                return;
+            }
+            let part = &points[k..(k + PART).min(points.len())];
+            (k, tried) = (k + PART, tried + 1);
+            let rays = rays_of(part);
+            let Some(narrow) = self.narrower(whole, part).filter(|_| rays > 0) else {
+                self.ask_points(None, complete, part, targets, cut, given, ignore, counter, work, blocked);
+                continue;
+            };
+            let closed = if complete {
+                (inner.count, inner_cut.count) = (0, 0);
+                let mut block = 0;
+                while block < given.blocks().len() {
+                    inner.take(&narrow, self.simd, &given.blocks[block], List::MOST, counter);
+                    block += 1;
+                }
+                true
+            } else {
+                self.gather(&narrow, cut.nodes(), rays, part.len(), inner_cut, inner, counter)
+            };
+            useful += u32::from(closed);
+            if closed && inner.count == 0 {
+                counter.rays(rays as u32);
+                continue;
+            }
+            if self.sheet_between(&narrow, if closed { Some(inner) } else { None }, sheet, ignore, counter) {
+                useful += 1;
+                counter.rays(rays as u32);
+                fill_all(blocked, part);
+                continue;
+            }
+            let narrow = Some(&narrow);
+            self.ask_points(narrow, closed, part, targets, inner_cut, inner, ignore, counter, work, blocked);
+        }
+    }
+
+    /// Asks for each point. If the list is complete, nothing else is there;
+    /// else it is empty, and all there is stands below the cut.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn ask_points(
+        &self,
+        shaft: Option<&Shaft>,
+        complete: bool,
+        points: &[TilePoint],
+        targets: &Targets<'_>,
+        cut: &Cut,
+        given: &mut List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        work: &mut Work<'_>,
+        blocked: &mut [u64],
+    ) {
+        self.simd.apart(
+            #[inline(always)]
+            || {
+                self.ask_points_here(
+                    shaft, complete, points, targets, cut, given, ignore, counter, work, blocked,
+                )
+            },
+        )
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn ask_points_here(
+        &self,
+        shaft: Option<&Shaft>,
+        complete: bool,
+        points: &[TilePoint],
+        targets: &Targets<'_>,
+        cut: &Cut,
+        given: &mut List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        work: &mut Work<'_>,
+        blocked: &mut [u64],
+    ) {
+        let Work { batch, learned, packet, abreast, walls } = work;
+        let flat = match shaft {
+            Some(shaft) if complete && rays_of(points) >= FEW * points.len() => {
                 Flat::new(targets, shaft, self.magnitude)
             }
             _ => None,
@@ -346,7 +460,8 @@ impl<S: Simd> Bvh<'_, S> {
                 if k == next {
                     next = (k + S::Packet::WIDTH).min(points.len());
                     let list = given.blocks();
-                    answered = self.ask_abreast(flat, &points[k..next], targets, list, ignore, counter, abreast);
+                    answered =
+                        self.ask_abreast(flat, &points[k..next], targets, list, ignore, counter, abreast);
                     let mut lane = 0;
                     while k + lane < next {
                         let TilePoint { first, count, .. } = points[k + lane];
@@ -363,6 +478,11 @@ impl<S: Simd> Bvh<'_, S> {
                     k += 1;
                     continue;
                 }
+            }
+            if packet.count == 0 && one_each(&points[k..], S::Packet::WIDTH) {
+                self.send_row(&points[k..], targets, cut, given, ignore, counter, blocked);
+                k += S::Packet::WIDTH;
+                continue;
             }
             let TilePoint { x, first, count } = points[k];
             let (mut from, end) = (first as usize, (first + count) as usize);
@@ -390,7 +510,8 @@ impl<S: Simd> Bvh<'_, S> {
                 } else {
                     let mut ask = u64::MAX >> (64 - part);
                     let mut word = 0;
-                    let aimed = (learned.count > 0 || !walls.is_empty())
+                    let aimed = ask != 0
+                        && (learned.count > 0 || !walls.is_empty())
                         && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude);
                     if aimed && !walls.is_empty() {
                         word = walls.hide(self.simd, &batch.pyramid, counter);
@@ -398,18 +519,28 @@ impl<S: Simd> Bvh<'_, S> {
                         counter.rays(word.count_ones());
                     }
                     if aimed && learned.count > 0 && ask != 0 {
+                        let asked = ask.count_ones();
                         let left = self.list_leaves(batch, learned, ask, true, ignore, counter);
                         counter.rays((ask & !left).count_ones());
                         (word, ask) = (word | ask & !left, left);
-                        if left.count_ones() * 4 > part as u32 {
+                        if left.count_ones() * 4 > asked {
                             learned.fail();
                         }
                     }
                     if ask != 0 {
                         let start =
                             Start { root: false, blocks: &[], nodes: cut.nodes(), entries: &[], shift: 0 };
-                        word |= self
-                            .packets_blocked(&start, x, targets, from, part, ask, ignore, counter, learned);
+                        word |= self.packets_blocked(
+                            &start,
+                            x,
+                            targets,
+                            from,
+                            part,
+                            ask,
+                            ignore,
+                            counter,
+                            &mut **learned,
+                        );
                     }
                     set(blocked, from, word);
                 }
@@ -463,6 +594,42 @@ impl<S: Simd> Bvh<'_, S> {
             k += usize::from(list.judge(k, (ask & hidden).count_ones(), may_go));
         }
         going.free
+    }
+
+    /// The rays of as many points as a packet holds, which have a target each, one after the other.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn send_row(
+        &self,
+        points: &[TilePoint],
+        targets: &Targets<'_>,
+        cut: &Cut,
+        list: &List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        blocked: &mut [u64],
+    ) {
+        let token = self.simd.token();
+        let mut lanes = [[0.0; 16]; 3];
+        let mut lane = 0;
+        while lane < S::Packet::WIDTH {
+            let [x, y, z] = points[lane].x;
+            (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (x, y, z);
+            lane += 1;
+        }
+        let first = points[0].first as usize;
+        let origin = vec3x::load(token, &lanes, 0);
+        let rays = Rays {
+            origin,
+            direction: vec3x::sub(targets_from::<S>(token, targets, first, first + S::Packet::WIDTH), origin),
+            t_min: S::Packet::splat(token, 0.0),
+            t_max: S::Packet::splat(token, 1.0),
+        };
+        let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[], shift: 0 };
+        counter.rays(S::Packet::WIDTH as u32);
+        let mut any = Any { blocked: 0, note: Nobody };
+        self.traverse_rays(&start, &rays, (1 << S::Packet::WIDTH) - 1, ignore, counter, &mut any);
+        set(blocked, first, u64::from(any.blocked));
     }
 
     /// The rays of a packet.
@@ -524,7 +691,8 @@ impl<S: Simd> Bvh<'_, S> {
         let Some(shaft) = self.shaft(&points, targets, frame) else { return false };
         let TileScratch { cut, given, .. } = scratch;
         given.count = 0;
-        self.gather(&shaft, STEPS[0] * STEPS[2], points.len(), cut, given, counter) && given.count == 0
+        let (root, rays) = (&self.nodes[..1], STEPS[0] * STEPS[2]);
+        self.gather(&shaft, root, rays, points.len(), cut, given, counter) && given.count == 0
     }
 
     /// The shaft around a tile's segments; `None` where it would say nothing.
@@ -536,20 +704,7 @@ impl<S: Simd> Bvh<'_, S> {
         if !reference.is_finite() {
             return None;
         }
-        let mut here = Around::<P<S>>::new(token, frame);
-        let mut k = 0;
-        while k < points.len() {
-            let mut lanes = [[0.0; 16]; 3];
-            let mut lane = 0;
-            while lane < P::<S>::WIDTH {
-                // The last point once more in the lanes beyond it.
-                let at = Vec3::from(points[(k + lane).min(points.len() - 1)].x) - reference;
-                (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (at.x, at.y, at.z);
-                lane += 1;
-            }
-            here.add(token, vec3x::load(token, &lanes, 0));
-            k += P::<S>::WIDTH;
-        }
+        let here = self.around(points, reference, frame);
         let mut there = Around::<P<S>>::new(token, targets.turn());
         let mut k = 0;
         while k < points.len() {
@@ -562,7 +717,35 @@ impl<S: Simd> Bvh<'_, S> {
                 i += P::<S>::WIDTH;
             }
         }
-        Shaft::new(reference, &here.finish(), &there.finish(), self.magnitude)
+        Shaft::new(reference, &here, &there.finish(), self.magnitude)
+    }
+
+    /// The shaft of some of the points.
+    #[inline(always)]
+    fn narrower(&self, shaft: &Shaft, points: &[TilePoint]) -> Option<Shaft> {
+        let here = self.around(points, shaft.reference, frame_of_points(points));
+        Shaft::new(shaft.reference, &here, &shaft.targets, self.magnitude)
+    }
+
+    /// A box around points, from the reference.
+    #[inline(always)]
+    fn around(&self, points: &[TilePoint], reference: Vec3, frame: [Vec3; 3]) -> Turned {
+        let token = self.simd.token();
+        let mut here = Around::<S::Packet>::new(token, frame);
+        let mut k = 0;
+        while k < points.len() {
+            let mut lanes = [[0.0; 16]; 3];
+            let mut lane = 0;
+            while lane < S::Packet::WIDTH {
+                // The last point once more in the lanes beyond it.
+                let at = Vec3::from(points[(k + lane).min(points.len() - 1)].x) - reference;
+                (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (at.x, at.y, at.z);
+                lane += 1;
+            }
+            here.add(token, vec3x::load(token, &lanes, 0));
+            k += S::Packet::WIDTH;
+        }
+        here.finish()
     }
 
     /// The whole tree as the only subtree.
@@ -571,6 +754,35 @@ impl<S: Simd> Bvh<'_, S> {
         cut.count = 0;
         let most = self.magnitude;
         cut.push(&Entry { child: Child::node(0), bounds: [[-most; 3], [most; 3]] });
+    }
+
+    /// Puts the children of a node that the shaft meets into the queue. False if there is no room for them.
+    #[inline(always)]
+    fn enqueue(
+        &self,
+        shaft: &Shaft,
+        node: &Node,
+        cut: &mut Cut,
+        len: &mut usize,
+        counter: &mut impl Counter,
+    ) -> bool {
+        counter.node_tests(node.len());
+        let mut met = shaft.children(self.simd, node);
+        while met != 0 {
+            let place = met.trailing_zeros() as usize & 7;
+            met &= met - 1;
+            if node.children[place] == Child::NONE {
+                continue;
+            }
+            if *len == QUEUE {
+                return false;
+            }
+            let [[a, b, c], [d, e, f]] = &node.bounds;
+            let bounds = [[a[place], b[place], c[place]], [d[place], e[place], f[place]]];
+            cut.queue[*len] = Entry { child: node.children[place], bounds };
+            *len += 1;
+        }
+        true
     }
 
     /// Does a sheet of triangles stand between all points and all targets of a shaft? `list` is all that the shaft
@@ -610,6 +822,7 @@ impl<S: Simd> Bvh<'_, S> {
     fn gather(
         &self,
         shaft: &Shaft,
+        roots: &[Node],
         rays: usize,
         points: usize,
         cut: &mut Cut,
@@ -618,91 +831,60 @@ impl<S: Simd> Bvh<'_, S> {
     ) -> bool {
         self.simd.apart(
             #[inline(always)]
-            || self.gather_here(shaft, rays, points, cut, list, counter),
+            || self.gather_here(shaft, roots, rays, points, cut, list, counter),
         )
     }
 
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn gather_here(
         &self,
         shaft: &Shaft,
+        roots: &[Node],
         rays: usize,
         points: usize,
         cut: &mut Cut,
         list: &mut List,
         counter: &mut impl Counter,
     ) -> bool {
-        let simd = self.simd;
         let [share, least, most] = STEPS;
         let steps = (rays / share).clamp(least, most);
         let room = if rays < FEW * points { 16 } else { 64 };
-        cut.count = 0;
+        (cut.count, list.count) = (0, 0);
         let (mut head, mut len) = (0, 0);
-        let mut next = Child::node(0);
         let mut done = 0;
-        // How far the queue had come when it was last short enough for a cut, and the list empty.
-        let mut saved = (0, 0);
-        loop {
-            if next.is_leaf() {
-                let block = &self.blocks[next.index()];
-                counter.triangle_tests(block.len() as u32);
-                let mut open = shaft.triangles(simd, block);
-                while open != 0 {
-                    let lane = open.trailing_zeros() as usize & 7;
-                    open &= open - 1;
-                    if block.ids[lane] != NO_TRIANGLE {
-                        if list.count == room {
-                            done = steps;
-                            break;
-                        }
-                        list.push(block, lane);
-                    }
-                }
-            } else {
-                let node = &self.nodes[next.index()];
-                counter.node_tests(node.len());
-                let mut met = shaft.children(simd, node);
-                while met != 0 {
-                    let place = met.trailing_zeros() as usize & 7;
-                    met &= met - 1;
-                    if node.children[place] == Child::NONE {
-                        continue;
-                    }
-                    if len == QUEUE {
-                        done = steps;
-                        break;
-                    }
-                    let corner = |side: usize| {
-                        [
-                            node.bounds[side][0][place],
-                            node.bounds[side][1][place],
-                            node.bounds[side][2][place],
-                        ]
-                    };
-                    cut.queue[len] = Entry { child: node.children[place], bounds: [corner(0), corner(1)] };
-                    len += 1;
-                }
-            }
+        while done < roots.len() {
+            // At most sixteen children, for which there is room.
+            self.enqueue(shaft, &roots[done], cut, &mut len, counter);
             done += 1;
-            if done > steps {
-                break;
-            }
+        }
+        // How far the queue had come when it was last short enough for a cut, and the list empty.
+        let mut saved = (0, len);
+        loop {
             if head == len {
                 return true;
             }
             if len - head <= CUT && list.count == 0 {
                 saved = (head, len);
             }
-            next = cut.queue[head].child;
+            if done > steps {
+                break;
+            }
+            let next = cut.queue[head].child;
             head += 1;
+            done += 1;
+            let enough = if next.is_leaf() {
+                list.take(shaft, self.simd, &self.blocks[next.index()], room, counter)
+            } else {
+                self.enqueue(shaft, &self.nodes[next.index()], cut, &mut len, counter)
+            };
+            if !enough {
+                break;
+            }
         }
         // A list that is not all there is would be asked for nothing as often as not.
         let (head, len) = saved;
         list.count = 0;
-        if len == 0 {
-            self.whole(cut);
-            return false;
-        }
         // The nearest come last, where a stack begins.
         let mut order = ArrayVec::<(f32, usize), CUT>::new();
         let mut k = head;
@@ -725,6 +907,33 @@ impl<S: Simd> Bvh<'_, S> {
             k += 1;
         }
         false
+    }
+}
+
+impl List {
+    /// Takes in the triangles of a block that the shaft meets. False if there is no room for them.
+    #[inline(always)]
+    fn take<S: Simd>(
+        &mut self,
+        shaft: &Shaft,
+        simd: S,
+        block: &TriangleBlock,
+        room: usize,
+        counter: &mut impl Counter,
+    ) -> bool {
+        counter.triangle_tests(block.len() as u32);
+        let mut open = shaft.triangles(simd, block);
+        while open != 0 {
+            let lane = open.trailing_zeros() as usize & 7;
+            open &= open - 1;
+            if block.ids[lane] != NO_TRIANGLE {
+                if self.count == room {
+                    return false;
+                }
+                self.push(block, lane);
+            }
+        }
+        true
     }
 }
 
@@ -786,6 +995,41 @@ fn run(points: &[TilePoint], k: &mut usize) -> (usize, usize) {
         *k += 1;
     }
     (first as usize, end as usize)
+}
+
+/// Have the first `count` points a target each, one after the other?
+#[inline(always)]
+fn one_each(points: &[TilePoint], count: usize) -> bool {
+    if points.len() < count {
+        return false;
+    }
+    let mut k = 0;
+    while k < count && points[k].count == 1 && points[k].first == points[0].first + k as u32 {
+        k += 1;
+    }
+    k == count
+}
+
+/// How many targets points have.
+#[inline(always)]
+fn rays_of(points: &[TilePoint]) -> usize {
+    let mut rays = 0;
+    let mut k = 0;
+    while k < points.len() {
+        rays += points[k].count as usize;
+        k += 1;
+    }
+    rays
+}
+
+/// Sets the bits of all targets of points.
+#[inline(always)]
+fn fill_all(blocked: &mut [u64], points: &[TilePoint]) {
+    let mut k = 0;
+    while k < points.len() {
+        let (first, end) = run(points, &mut k);
+        fill(blocked, first, end - first);
+    }
 }
 
 /// Clears the bits of `count` targets from the `first`th on.
