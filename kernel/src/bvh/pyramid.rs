@@ -362,6 +362,8 @@ impl Pyramid {
         let (first, last) = (P::<S>::splat(token, f32::INFINITY), P::<S>::splat(token, f32::NEG_INFINITY));
         let (mut low, mut high) = ([first; 3], [last; 3]);
         let (mut near, mut far) = ([first; 3], [last; 3]);
+        // Stays 0 as long as all is finite; the least and the greatest may lose what is not a number.
+        let mut odd = P::<S>::splat(token, 0.0);
         let mut along = [0u64; 3];
         let mut i = 0;
         while i < count {
@@ -376,6 +378,8 @@ impl Pyramid {
             s.store(&mut this.s[i..]);
             t.store(&mut this.t[i..]);
             w.store(&mut this.w[i..]);
+            let sum = s + t + w;
+            odd = odd + (sum - sum);
             let [a, b, c] = vec3x::abs(d);
             let first = (b.le(a) & c.le(a)).bits();
             let second = c.le(b).bits() & !first;
@@ -393,7 +397,8 @@ impl Pyramid {
         let greatest = Vec3::new(greatest_of(high[0]), greatest_of(high[1]), greatest_of(high[2]));
         (this.least, this.greatest) = (least, greatest);
         // Written so that NaN fails.
-        if !(least.z > 0.0 && greatest.z <= 4.0 * least.z && greatest.is_finite() && least.is_finite()) {
+        let finite = greatest.is_finite() && least.is_finite() && sum_of(odd) == 0.0;
+        if !(least.z > 0.0 && greatest.z <= 4.0 * least.z && finite) {
             return false;
         }
         let position = 16.0 * ROUNDING * this.reach;

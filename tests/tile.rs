@@ -1,0 +1,200 @@
+//! Tiles of neighbouring points under a flat light: sheets that hide all of it, short lists, narrower shafts. Every
+//! answer is that of a single ray.
+
+use glam::Vec3;
+use occlude_host::accel::{Accel, Quality};
+use occlude_kernel::{Counts, Ray, Targets, TilePoint, TileScratch, offset};
+use occlude_tests::{Family, On, Random, families};
+
+type Triangle = [Vec3; 3];
+
+/// A parallelogram, skewed as it may be.
+struct Light {
+    corner: Vec3,
+    u: Vec3,
+    v: Vec3,
+}
+
+impl Light {
+    fn at(&self, s: f32, t: f32) -> Vec3 {
+        self.corner + self.u * s + self.v * t
+    }
+}
+
+/// What stands between points around the origin and a light about `away` from it.
+fn blockers(random: &mut Random, away: Vec3, size: f32) -> Vec<Triangle> {
+    let mut triangles = Vec::new();
+    let (across, along) = away.normalize().any_orthonormal_pair();
+    for _ in 0..=random.below(3) {
+        let middle = away * random.between(-0.05, 1.05);
+        let wide = size * random.any_scale(-1.5, 0.7);
+        match random.below(4) {
+            // A sheet, flat or dented, in few or in many pieces.
+            0 | 1 => {
+                let pieces = 1 + random.below(5);
+                let dent = if random.below(2) == 0 { 0.0 } else { random.between(0.0, 0.3) };
+                let shift = random.point() * (wide * 0.8);
+                let mut grid = Vec::new();
+                for row in 0..=pieces {
+                    for column in 0..=pieces {
+                        let (x, y) = (column as f32 / pieces as f32 - 0.5, row as f32 / pieces as f32 - 0.5);
+                        let bump = away * (dent * random.between(-0.3, 0.3));
+                        grid.push(middle + shift + (across * x + along * y) * (2.0 * wide) + bump);
+                    }
+                }
+                let at = |row: usize, column: usize| grid[row * (pieces + 1) + column];
+                for row in 0..pieces {
+                    for column in 0..pieces {
+                        let [a, b] = [at(row, column), at(row, column + 1)];
+                        let [c, d] = [at(row + 1, column + 1), at(row + 1, column)];
+                        triangles.extend([[a, b, c], [a, c, d]]);
+                    }
+                }
+            }
+            // Slivers.
+            2 => {
+                for _ in 0..random.below(20) {
+                    let a = middle + random.point() * wide;
+                    let b = a + random.direction() * wide;
+                    triangles.push([a, b, a.lerp(b, 0.5) + random.point() * (wide * 0.01)]);
+                }
+            }
+            // Anything.
+            _ => {
+                for _ in 0..random.below(60) {
+                    let a = middle + random.point() * wide;
+                    triangles.push([a, a + random.point() * wide, a + random.point() * wide]);
+                }
+            }
+        }
+    }
+    triangles
+}
+
+/// A tile and its light, and how many rays were blocked and free.
+fn trial(random: &mut Random, each: usize) -> [usize; 2] {
+    let scale = random.any_scale(-3.0, 3.0);
+    let away = random.direction() * scale * random.between(0.5, 5.0);
+    let size = scale * random.any_scale(-1.5, 0.3);
+    let (u, v) = away.normalize().any_orthonormal_pair();
+    let skew = random.between(-0.9, 0.9);
+    let light = Light {
+        corner: away - (u + v) * (0.5 * size),
+        u: (u + random.point() * 0.5) * size,
+        v: (v + u * skew + random.point() * 0.5) * (size * random.any_scale(-1.0, 0.5)),
+    };
+    let facing = light.u.cross(light.v).normalize_or_zero();
+    let facing = if facing.dot(away) > 0.0 { -facing } else { facing };
+    let place = random.point() * (scale * random.any_scale(-1.0, 3.0));
+    let mut triangles = blockers(random, away, size);
+    // The surface the points lie on, flat or round.
+    let (a, b) = random.direction().any_orthonormal_pair();
+    let spread = scale * random.any_scale(-3.0, -0.5);
+    let round = if random.below(2) == 0 { 0.0 } else { random.between(0.0, 2.0) };
+    let normal = if a.cross(b).dot(away) < 0.0 { b.cross(a) } else { a.cross(b) };
+    let ground = |x: f32, y: f32| (a * x + b * y - normal * (round * (x * x + y * y))) * spread;
+    for row in 0..4 {
+        for column in 0..4 {
+            let [x0, x1] = [column, column + 1].map(|k| k as f32 * 0.5 - 1.0);
+            let [y0, y1] = [row, row + 1].map(|k| k as f32 * 0.5 - 1.0);
+            let [p, q, r, s] = [ground(x0, y0), ground(x1, y0), ground(x1, y1), ground(x0, y1)];
+            triangles.extend([[p, q, r], [p, r, s]]);
+        }
+    }
+    triangles.iter_mut().flatten().for_each(|vertex| *vertex += place);
+    let accel = Accel::from_triangles(&triangles, Quality::Medium);
+    let bvh = accel.bvh();
+    let clearance = bvh.clearance();
+
+    let edge = 8;
+    let (mut points, mut ends) = (Vec::new(), Vec::new());
+    let loose = if random.below(4) == 0 { 1e4 } else { 1.0 };
+    for row in 0..edge {
+        for column in 0..edge {
+            let [x, y] = [column, row].map(|k| (k as f32 + random.unit()) / edge as f32 * 2.0 - 1.0);
+            let x = offset(ground(x, y) + place, normal, clearance);
+            points.push(TilePoint { x: x.into(), first: ends.len() as u32, count: each as u32 });
+            for _ in 0..each {
+                let y = light.at(random.unit(), random.unit()) + place;
+                ends.push(offset(
+                    y,
+                    facing,
+                    clearance * if loose > 1.0 { loose * random.unit() } else { 1.0 },
+                ));
+            }
+        }
+    }
+    let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+    let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+    let flat = any.on_parallelogram(light.corner + place, light.u, light.v);
+    let single = On { bvh, family: Family::Scalar };
+    let mut want = vec![0u64; ends.len().div_ceil(64)];
+    for point in &points {
+        for i in point.first as usize..(point.first + point.count) as usize {
+            let ray = Ray::segment(point.x, ends[i]);
+            let hit = single.occluded(&ray, None, &mut Counts::default());
+            want[i / 64] |= u64::from(hit) << (i % 64);
+        }
+    }
+    let mut scratch = TileScratch::new();
+    for on in families(bvh) {
+        for targets in [any, flat] {
+            let mut blocked = vec![0; want.len()];
+            let mut counts = Counts::default();
+            on.occluded_tile(&points, &targets, None, &mut counts, &mut scratch, &mut blocked);
+            assert_eq!(counts.rays, ends.len() as u64);
+            let differ: u32 = want.iter().zip(&blocked).map(|(a, b)| (a ^ b).count_ones()).sum();
+            assert!(
+                differ == 0,
+                "{}: {differ} of {} rays, {each} each, {triangles:?}",
+                on.family,
+                ends.len()
+            );
+        }
+    }
+    let hits = want.iter().map(|word| word.count_ones() as usize).sum();
+    [hits, ends.len() - hits]
+}
+
+#[test]
+fn tiles_answer_as_single_rays_do() {
+    let mut random = Random::new(20);
+    for (each, trials) in [(1, 600), (4, 400), (16, 300), (64, 150), (100, 20)] {
+        let mut total = [0, 0];
+        let mut whole = 0;
+        for _ in 0..trials {
+            let [blocked, free] = trial(&mut random, each);
+            whole += usize::from(blocked == 0 || free == 0);
+            total = [total[0] + blocked, total[1] + free];
+        }
+        // Scenes where everything or nothing is hidden, and others, in numbers.
+        assert!(total.iter().all(|&rays| rays > 20 * each * trials), "{each} rays a point: {total:?}");
+        assert!(whole > trials / 20 && whole < trials * 19 / 20, "{each} rays a point: {whole} of {trials}");
+    }
+}
+
+#[test]
+fn a_target_that_is_no_number_is_free() {
+    // A sheet hides all of the light, but nothing hides what is nowhere.
+    let sheet = [[Vec3::new(-9.0, -9.0, 1.0), Vec3::new(9.0, -9.0, 1.0), Vec3::new(0.0, 9.0, 1.0)]];
+    let accel = Accel::from_triangles(&sheet, Quality::Fast);
+    let points: Vec<TilePoint> =
+        (0..64).map(|k| TilePoint { x: [k as f32 * 1e-3, 0.0, 0.0], first: 16 * k, count: 16 }).collect();
+    let at = |i: usize| (i % 16) as f32 / 16.0;
+    let [mut xs, ys, zs]: [Vec<f32>; 3] =
+        [(0..1024).map(at).collect(), (0..1024).map(|i| at(i / 4)).collect(), vec![2.0; 1024]];
+    for odd in [f32::NAN, f32::INFINITY] {
+        xs[500] = odd;
+        let targets = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let targets = targets.on_parallelogram(Vec3::Z * 2.0, Vec3::X, Vec3::Y);
+        for on in families(accel.bvh()) {
+            let mut blocked = [0; 16];
+            let scratch = &mut TileScratch::new();
+            on.occluded_tile(&points, &targets, None, &mut Counts::default(), scratch, &mut blocked);
+            for (i, word) in blocked.iter().enumerate() {
+                let want = if i == 500 / 64 { !(1 << (500 % 64)) } else { u64::MAX };
+                assert_eq!(*word, want, "{}: word {i}", on.family);
+            }
+        }
+    }
+}
