@@ -1,9 +1,11 @@
 //! Neighbouring points and one light: what all their segments have in common is asked once.
 //!
 //! A shaft around the points and the targets goes down the tree first. Often it comes back empty, and every target
-//! is visible. Else it yields the few triangles there are, side by side in blocks of their own, or, where they are
-//! many, the subtrees to begin with. Each point then starts from these and not from the root; and the triangles
-//! that blocked anything for one point are asked first for the next.
+//! is visible; or a sheet of triangles stands across it ([`super::cover`]), and none is. Else it yields the few triangles
+//! there are, side by side in blocks of their own, or, where they are many, the subtrees to begin with. Long lists and
+//! subtrees are cut down by narrower shafts for parts of the points. Then the points are asked: abreast against a list
+//! ([`super::abreast`]), or one by one from the subtrees on, where the triangles that blocked anything for one point are
+//! asked first for the next.
 
 use super::abreast::{Abreast, Flat};
 use super::batch::{BatchScratch, FEW, targets_from};
@@ -275,7 +277,7 @@ impl<S: Simd> Bvh<'_, S> {
     /// too short.
     ///
     /// Any points and any targets get right answers. It pays where the points are neighbours, such as those of 8
-    /// by 8 pixels, and the targets lie on one light.
+    /// by 8 pixels, also in their order (a Z curve is best), and the targets lie on one light.
     #[inline(always)]
     pub fn occluded_tile(
         &self,
