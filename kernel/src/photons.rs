@@ -345,6 +345,12 @@ impl<'a, S: Simd> Photons<'a, S> {
         self.map
     }
 
+    /// The map of those of later rounds, if there are any.
+    #[inline]
+    pub fn later(&self) -> Option<PhotonMap<'a, S>> {
+        self.later
+    }
+
     /// What the nearest photons say: of one kind, *lit* or *dark*; of both, *penumbra*, and `room` receives the
     /// blockers they name.
     ///

@@ -19,7 +19,7 @@ use crate::sampler::Pattern;
 use crate::scene::{CameraRequest, Frame, Scene, load};
 use occlude_kernel::Counts;
 use occlude_kernel::lanes::{Task, dispatch, level_name};
-use occlude_kernel::photons::{Class, Nearest, Neighbour};
+use occlude_kernel::photons::{Class, Nearest};
 use rayon::prelude::*;
 use std::path::Path;
 use std::time::Instant;
@@ -196,8 +196,14 @@ impl Setting {
     }
 
     fn prepare(&self, run: &Run<'_>, kind: BlockerKind, lines: u64, k: usize) -> PreparedMap {
-        let options =
-            MapOptions { lines: Some(lines), k, radius: None, blockers: kind, quality: Quality::Medium };
+        let options = MapOptions {
+            lines: Some(lines),
+            rounds: 1,
+            k,
+            radius: None,
+            blockers: kind,
+            quality: Quality::Medium,
+        };
         PreparedMap::new(&self.stage(run, 1, false), &options)
     }
 
@@ -293,7 +299,7 @@ impl Task for Judge<'_> {
     #[inline(always)]
     fn run<S: occlude_kernel::Simd>(self, simd: S) -> Vec<Called> {
         let photons = self.prepared.store.by_light();
-        let mut slots = vec![Neighbour::NONE; Nearest::room(self.prepared.k())];
+        let mut slots = crate::photons::slots(self.prepared.k());
         let mut nearest = Nearest::new(self.prepared.k(), &mut slots).expect("room for k");
         let mut room = vec![0; 8192];
         let mut called = Vec::new();
