@@ -398,10 +398,12 @@ impl Shower<'_> {
                     .occlusion
                     .extend(trail.occlusion.iter().map(|p| OcclusionPhoton { first: p.first + base, ..*p }));
                 store.blockers.extend_from_slice(&trail.blockers);
-                for kind in 0..2 {
-                    store.surfaces[kind].extend_from_slice(&trail.surfaces[kind]);
-                    cells[kind].extend_from_slice(&trail.cells[kind]);
-                }
+                store
+                    .surfaces
+                    .iter_mut()
+                    .zip(&trail.surfaces)
+                    .for_each(|(to, from)| to.extend_from_slice(from));
+                cells.iter_mut().zip(&trail.cells).for_each(|(to, from)| to.extend_from_slice(from));
                 store.stats.dropped_blockers += trail.dropped_blockers;
                 store.stats.dropped_photons += trail.dropped_photons;
                 store.stats.lost += trail.lost;

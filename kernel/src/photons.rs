@@ -272,7 +272,7 @@ pub struct Blockers<'b> {
 #[derive(Clone, Copy, Debug)]
 pub struct Photons<'a, S> {
     map: PhotonMap<'a, S>,
-    later: Option<PhotonMap<'a, S>>,
+    later: PhotonMap<'a, S>,
     occlusion: &'a [OcclusionPhoton],
     blockers: &'a [u32],
 }
@@ -299,7 +299,7 @@ impl<'a, S: Simd> Photons<'a, S> {
         occlusion: &'a [OcclusionPhoton],
         blockers: &'a [u32],
     ) -> Result<Self, PhotonsError> {
-        Self { map, later: None, occlusion, blockers }.checked(map)
+        Self { map, later: map.without_photons(), occlusion, blockers }.checked(map)
     }
 
     /// The same with the photons of later rounds, of which more were shot here than there, sorted apart. They refer to
@@ -311,7 +311,7 @@ impl<'a, S: Simd> Photons<'a, S> {
     /// photons say so and no later one objects: later photons turn calls into penumbrae and add names, and no point is
     /// called wrongly that the even photons alone call rightly. Where no even photon is near, nothing is known.
     pub fn with_later(self, later: PhotonMap<'a, S>) -> Result<Self, PhotonsError> {
-        Self { later: (!later.blocks().is_empty()).then_some(later), ..self }.checked(later)
+        Self { later, ..self }.checked(later)
     }
 
     fn checked(self, map: PhotonMap<'a, S>) -> Result<Self, PhotonsError> {
@@ -332,11 +332,8 @@ impl<'a, S: Simd> Photons<'a, S> {
     /// The same photons, asked with other vectors.
     #[inline(always)]
     pub fn on<T: Simd>(&self, simd: T) -> Photons<'a, T> {
-        let later = match &self.later {
-            Some(later) => Some(later.on(simd)),
-            None => None,
-        };
-        Photons { map: self.map.on(simd), later, occlusion: self.occlusion, blockers: self.blockers }
+        let (map, later) = (self.map.on(simd), self.later.on(simd));
+        Photons { map, later, occlusion: self.occlusion, blockers: self.blockers }
     }
 
     /// The map alone, of the photons shot evenly.
@@ -348,7 +345,7 @@ impl<'a, S: Simd> Photons<'a, S> {
     /// The map of those of later rounds, if there are any.
     #[inline]
     pub fn later(&self) -> Option<PhotonMap<'a, S>> {
-        self.later
+        (!self.later.blocks().is_empty()).then_some(self.later)
     }
 
     /// What the nearest photons say: of one kind, *lit* or *dark*; of both, *penumbra*, and `room` receives the
@@ -360,18 +357,17 @@ impl<'a, S: Simd> Photons<'a, S> {
         self.map.nearest(place, nearest);
         let k = nearest.k();
         let (found, more) = nearest.and_more();
-        if let (Some(later), Some(mut more), false) = (&self.later, more, found.is_empty()) {
-            let mut reach = f32::INFINITY;
-            if found.len() == k {
-                reach = 0.0;
-                for neighbour in found {
-                    reach = reach.max(neighbour.distance_squared());
-                }
+        let asked = !found.is_empty() && !self.later.blocks().is_empty();
+        let (Some(mut more), true) = (more, asked) else { return self.judge_all(found, &[], room) };
+        let mut reach = f32::INFINITY;
+        if found.len() == k {
+            reach = 0.0;
+            for neighbour in found {
+                reach = reach.max(neighbour.distance_squared());
             }
-            later.nearest(&place.within(reach), &mut more);
-            return self.judge_all(found, more.found(), room);
         }
-        self.judge_all(found, &[], room)
+        self.later.nearest(&place.within(reach), &mut more);
+        self.judge_all(found, more.found(), room)
     }
 
     /// The same for photons already found.

@@ -26,7 +26,7 @@ pub struct MapArgs {
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     photon_k: Option<u32>,
 
-    /// How far to look for them [default: three times as far as they are on average].
+    /// How far to look for them [default: three times as far as those of the even round are on average].
     #[arg(long, value_name = "R", value_parser = radius)]
     photon_radius: Option<f32>,
 
