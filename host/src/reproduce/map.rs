@@ -400,6 +400,9 @@ fn percent(share: f64) -> String {
 
 /// A change in per cent, with its sign.
 fn change(from: f64, to: f64) -> Entry {
+    if to == from {
+        return "0 %".into();
+    }
     let change = 100.0 * (to / from - 1.0);
     let text = format!("{}{} %", if change < 0.0 { "−" } else { "+" }, number(change.abs(), 2));
     Entry::from(text).tone(if change < 0.0 { Tone::Good } else { Tone::Bad })
