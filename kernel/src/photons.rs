@@ -182,7 +182,7 @@ impl Place {
     /// The same place, looked at no farther than the root of `square`.
     #[inline(always)]
     fn within(&self, square: f32) -> Self {
-        let radius = square.sqrt();
+        let radius = libm::sqrtf(square);
         Self { radius: if radius < self.radius { radius } else { self.radius }, ..*self }
     }
 
