@@ -203,6 +203,43 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["reproduce", "theory", "-o", &cornell], "--force"),
         (&["reproduce", "map", "-o", &cornell], "--force"),
         (&["render", &cornell, "--photons", "9"], "--blockers map"),
+        (&["render", &cornell, "--photon-rounds", "3"], "--blockers map"),
+        (&["render", &cornell, "--method", "map", "--photon-rounds", "0"], "--photon-rounds"),
+        (
+            &["render", &cornell, "--method", "map", "--blocker-trees", "--blocker-kind", "object"],
+            "--blocker-kind triangle",
+        ),
+        (&["render", &cornell, "--blocker-trees"], "--blockers map"),
+        (&["render", &cornell, "--method", "map", "--test-rays", "cell"], "--method stochastic"),
+        (&["render", &cornell, "--method", "stochastic", "--test-rays", "point"], "importance or optimal"),
+        (
+            &[
+                "render",
+                &cornell,
+                "--method",
+                "stochastic",
+                "--probabilities",
+                "optimal",
+                "--test-rays",
+                "cell",
+            ],
+            "--blockers map",
+        ),
+        (&["render", &half_plane, "--method", "stochastic", "--split", "treelet"], "--blockers map"),
+        (
+            &[
+                "render",
+                &cornell,
+                "--method",
+                "stochastic",
+                "--blockers",
+                "map",
+                "--split",
+                "treelet",
+                "--blocker-trees",
+            ],
+            "--split sorted",
+        ),
         (&["render", &cornell, "--blockers", "map"], "--method stochastic"),
         (&["render", &cornell, "--method", "stochastic", "--photon-k", "9"], "--blockers map"),
         (
@@ -453,7 +490,7 @@ fn maps_render_and_are_shown() {
     let plates = scene("plates");
     let common = ["--size", "32x24", "--photons", "5000"];
     let small = ["--spp", "1", "--shadow-rays", "8", "--quiet", "-o", "a.pfm", "--stats", "s.json"];
-    let ways: [(&[&str], &str); 5] = [
+    let ways: [(&[&str], &str); 9] = [
         (&["--method", "map"], "map"),
         (&["--method", "map", "--blockers", "triangle"], "map"),
         (&["--method", "map", "--blocker-kind", "object"], "map"),
@@ -476,6 +513,30 @@ fn maps_render_and_are_shown() {
             ],
             "map + stochastic residual optimal sorted quotas",
         ),
+        (&["--method", "map", "--photon-rounds", "3"], "map"),
+        (&["--method", "map", "--blocker-trees", "--volumetric", "off"], "map, trees"),
+        (
+            &["--method", "stochastic", "--blockers", "map", "--split", "treelet", "--volumetric", "on"],
+            "map + stochastic balanced uniform treelet",
+        ),
+        (
+            &[
+                "--method",
+                "stochastic",
+                "--blockers",
+                "map",
+                "--blocker-trees",
+                "--split",
+                "sorted",
+                "--probabilities",
+                "importance",
+                "--test-rays",
+                "cell",
+                "--photon-rounds",
+                "2",
+            ],
+            "map + stochastic balanced importance sorted, trees, by cells",
+        ),
     ];
     for (way, name) in ways {
         let args = [&["render", &plates][..], &common, &small, way].concat();
@@ -485,6 +546,10 @@ fn maps_render_and_are_shown() {
         let stats: serde_json::Value = serde_json::from_str(&json).expect("JSON");
         assert_eq!(stats["method"], name);
         assert_eq!(stats["map"]["lines"], 5000);
+        let rounds = way.iter().position(|arg| *arg == "--photon-rounds").map_or("1", |at| way[at + 1]);
+        assert_eq!(stats["map"]["rounds"].to_string(), rounds);
+        assert_eq!(stats["map"]["adaptive"], rounds != "1");
+        assert_eq!(stats["map"]["later_lines"], if rounds == "1" { 0 } else { 2500 });
         assert!(stats["map"]["penumbra"].as_u64() > Some(0), "{json}");
     }
     for file in ["m.png", "m.ply"] {
@@ -504,7 +569,7 @@ fn the_map_is_reproduced() {
     let html = std::fs::read_to_string(page.join("index.html")).expect("a page");
     assert!(html.contains("left out"), "says which scenes are not there");
     let results = rows(&page.join("map.csv"));
-    assert_eq!(results.len(), 4 * 9);
+    assert_eq!(results.len(), 4 * 19);
     for row in &results {
         assert!(row["rmse"].parse::<f64>().expect("a number") > 0.0, "{row:?}");
     }
@@ -515,5 +580,26 @@ fn the_map_is_reproduced() {
         let parts = ["lit", "dark", "penumbra", "unknown"].map(number);
         assert_eq!(parts.iter().sum::<u64>(), number("points_and_lights"), "{row:?}");
     }
-    assert!(rows(&page.join("photons.csv")).len() >= 4 * 3);
+    let of = |scene: &str, method: &str, column: &str| -> f64 {
+        let row = results.iter().find(|row| row["scene"] == scene && row["method"] == method);
+        row.expect("a row")[column].parse().expect("a number")
+    };
+    for scene in ["spheres", "city", "forest", "sponge"] {
+        let tests = |method: &str| of(scene, method, "triangle_tests");
+        assert_eq!(of(scene, "plain: map", "rmse"), of(scene, "trees for each point: map", "rmse"));
+        assert!(tests("plain: map + stochastic") < tests("plain: map"), "{scene}");
+        let [none, cell, point] = ["plain", "importance for each cell", "importance for each point"]
+            .map(|name| tests(&format!("{name}: map + stochastic")));
+        assert!(none < cell && cell < point, "{scene}: {none} {cell} {point}");
+    }
+    assert_eq!(rows(&page.join("photons.csv")).len(), 4 * 3 * 2);
+    assert_eq!(rows(&page.join("why.csv")).len(), 4 * 3 * 2);
+    let rounds = rows(&page.join("rounds.csv"));
+    assert_eq!(rounds.len(), 4 * 2 * 2 * 2);
+    let missed = |many: &str| -> f64 {
+        let of = rounds.iter().filter(|row| row["rounds"] == many);
+        of.map(|row| row["missed_blockers"].parse::<f64>().expect("a number")).sum()
+    };
+    // Over all scenes; about a quarter, so that half is far from what chance does.
+    assert!(missed("3") < 0.5 * missed("1"), "{} {}", missed("3"), missed("1"));
 }

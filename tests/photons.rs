@@ -244,6 +244,103 @@ fn three_cases_and_the_union_of_the_names() {
     assert_eq!((list.len(), dropped > 0), (3, true));
 }
 
+/// Photons of later rounds, against a loop over all of them.
+#[test]
+fn later_photons_only_object() {
+    let mut random = Random::new(23);
+    let mut seen = [0; 5];
+    for round in 0..1500 {
+        // Light photons at x < 0, mostly; each occlusion photon names a blocker of its own.
+        let spread = random.between(0.0, 0.4);
+        let counts = [random.below(60), random.below(200)];
+        let mut crowd: [Vec<(Vec3, PhotonId)>; 2] = [Vec::new(), Vec::new()];
+        let (mut lit, mut dark) = (0, Vec::new());
+        for (part, &count) in crowd.iter_mut().zip(&counts) {
+            for _ in 0..count {
+                let at = random.point();
+                if at.x + spread * random.between(-1.0, 1.0) < 0.0 {
+                    part.push((at, PhotonId::light(lit)));
+                    lit += 1;
+                } else {
+                    let id = dark.len() as u32;
+                    part.push((at, PhotonId::occlusion(id)));
+                    dark.push(OcclusionPhoton { position: at.to_array(), light: 0, first: id, len: 1 });
+                }
+            }
+        }
+        let names: Vec<u32> = (0..dark.len() as u32).map(|name| 3 * name).collect();
+        let maps = crowd.each_ref().map(|part| {
+            let mut blocks = vec![PhotonBlock::EMPTY; part.len().div_ceil(8)];
+            for (point, &(at, id)) in PhotonBlock::as_points(&mut blocks).iter_mut().zip(part) {
+                *point = Point { position: at.to_array(), id };
+            }
+            let mut splits = vec![Split::NONE; blocks.len()];
+            PhotonTree::new(&mut blocks, &mut splits).expect("as many").build();
+            (blocks, splits)
+        });
+        let [even, later] = maps.each_ref().map(|(b, s)| PhotonMap::new(b, s).expect("a map"));
+        let alone = Photons::new(even, &dark, &names).expect("sound");
+        let both = alone.with_later(later).expect("sound");
+        if dark.len() > 1 {
+            assert!(Photons::new(even, &dark[..1], &names).and_then(|p| p.with_later(later)).is_err());
+        }
+        let (k, most) = ([1, 4, 10][round % 3], [0, 3, 1000][round / 3 % 3]);
+        let radius = [0.2, 0.5, 4.0][round % 3];
+        let x = random.point();
+        let place = if round % 2 == 0 {
+            Place::ball(x, radius)
+        } else {
+            Place::disc(x, random.direction(), radius, 3.0)
+        };
+        let near = |part: &[(Vec3, PhotonId)], reach: f32| {
+            let far = |&(at, id): &(Vec3, PhotonId)| (place.distance_squared(at), id);
+            let mut all: Vec<_> = part.iter().map(far).filter(|(square, _)| *square <= reach).collect();
+            all.sort_by(|a, b| a.partial_cmp(b).expect("numbers"));
+            all
+        };
+        let mut expected = near(&crowd[0], radius * radius);
+        expected.truncate(k);
+        if !expected.is_empty() && most > 0 {
+            let last = expected.last().map_or(0.0, |(square, _)| *square);
+            let reach = if expected.len() == k { last.sqrt() * last.sqrt() } else { radius * radius };
+            let mut more = near(&crowd[1], reach);
+            more.truncate(most);
+            expected.extend(more);
+        }
+        let light = expected.iter().filter(|(_, id)| id.is_light()).count();
+        let mut named: Vec<u32> =
+            expected.iter().filter(|(_, id)| !id.is_light()).map(|(_, id)| 3 * id.index() as u32).collect();
+        named.sort_unstable();
+        let want = match (expected.len(), light) {
+            (0, _) => Class::Unknown,
+            (all, light) if all == light => Class::Lit,
+            (_, 0) => Class::Dark,
+            _ => Class::Penumbra(Blockers { list: &named, dropped: 0 }),
+        };
+        let spare = if most == 0 { 0 } else { Nearest::room(most) };
+        let mut slots = vec![Neighbour::NONE; Nearest::room(k) + spare];
+        let mut nearest = Nearest::new(k, &mut slots).expect("room");
+        let (mut room, mut other) = ([0; 512], [0; 512]);
+        let told = both.classify(&place, &mut nearest, &mut room);
+        assert_eq!(told, want, "round {round}");
+        // A later photon objects, or changes nothing.
+        let without = alone.classify(&place, &mut nearest, &mut other);
+        match (without, told) {
+            (Class::Penumbra(few), Class::Penumbra(all)) => {
+                assert!(few.list.iter().all(|name| all.list.contains(name)));
+                seen[usize::from(few.list.len() < all.list.len())] += 1;
+            }
+            (Class::Lit, Class::Penumbra(_)) => seen[2] += 1,
+            (Class::Dark, Class::Penumbra(_)) => seen[3] += 1,
+            (before, after) => {
+                assert_eq!(before, after);
+                seen[4] += 1;
+            }
+        }
+    }
+    assert!(seen.iter().all(|&count| count > 10), "{seen:?}");
+}
+
 /// A lamp over two crossed boards, a slab with a hole and a floor.
 fn boards() -> Scene {
     let text = "o lamp\nv -1 4 -1\nv 1 4 -1\nv 1 4 1\nv -1 4 1\nusemtl lamp\nf 1 2 3 4\n\
@@ -329,20 +426,69 @@ fn any_number_of_threads_shoots_the_same_photons() {
     let accel = Accel::build(&scene, Quality::Fast);
     let lights = lights(&scene);
     let blockers = BlockerSet::new(BlockerKind::Triangle, &scene, &accel.bvh(), Quality::Fast);
-    let shot = |threads| {
+    let shot = |rounds, threads| {
         let pool = rayon::ThreadPoolBuilder::new().num_threads(threads).build().expect("threads");
-        let store = pool.install(|| shower(&accel, &lights, &blockers, 60_000).shoot());
+        let shower = shower(&accel, &lights, &blockers, 60_000);
+        let store = pool.install(|| shower.shoot_in_rounds(rounds, &scene));
+        assert_eq!((store.stats.rounds, store.stats.lines), (rounds, 60_000));
         let maps: Vec<Vec<u8>> = store
             .by_light()
             .iter()
-            .map(|photons| bytemuck::cast_slice(photons.map().blocks()).to_vec())
+            .flat_map(|photons| [Some(photons.map()), photons.later()])
+            .flatten()
+            .map(|map| bytemuck::cast_slice(map.blocks()).to_vec())
             .collect();
+        assert_eq!(maps.len(), if rounds > 1 { 4 } else { 2 }, "two lights");
         let names: Vec<Vec<u32>> =
             store.occlusion().iter().map(|photon| store.named(photon).to_vec()).collect();
         (store.light().to_vec(), store.occlusion().to_vec(), names, maps)
     };
-    let one = shot(1);
-    assert!(one == shot(2) && one == shot(5));
+    for rounds in [1, 2, 4] {
+        let one = shot(rounds, 1);
+        assert!(one == shot(rounds, 2) && one == shot(rounds, 5));
+    }
+    assert!(shot(1, 2).0 != shot(2, 2).0);
+    let even = shower(&accel, &lights, &blockers, 60_000).shoot();
+    assert!(even.light() == shot(1, 2).0);
+}
+
+/// Half of the lines of rounds are even: as if no more had been asked for. Of the other half more meet a border than of
+/// the even ones.
+#[test]
+fn rounds_begin_evenly_and_go_where_shadows_end() {
+    let scene = boards();
+    let accel = Accel::build(&scene, Quality::Fast);
+    let lights = lights(&scene);
+    let blockers = BlockerSet::new(BlockerKind::Triangle, &scene, &accel.bvh(), Quality::Fast);
+    let store = shower(&accel, &lights, &blockers, 40_000).shoot_in_rounds(3, &scene);
+    let half = shower(&accel, &lights, &blockers, 20_000).shoot();
+    assert_eq!((store.stats.later_lines, half.stats.later_lines), (20_000, 0));
+    let ids = |blocks: &[PhotonBlock]| {
+        blocks.iter().flat_map(|block| block.ids).filter(|id| *id != PhotonId::NONE).count()
+    };
+    let even = half.by_light()[0];
+    for (rounds, alone) in store.by_light().iter().zip(half.by_light()) {
+        assert_eq!(ids(rounds.map().blocks()), ids(alone.map().blocks()));
+    }
+    // On the floor, where the lamp is seen in part: between the shadows of the boards' ends.
+    let share = |map: PhotonMap<'_>| {
+        let (mut near, mut all) = (0, 0);
+        let mut room = [0; 512];
+        let mut slots = vec![Neighbour::NONE; Nearest::room(24)];
+        let mut nearest = Nearest::new(24, &mut slots).expect("room");
+        for block in map.blocks() {
+            for lane in (0..8).filter(|&lane| block.ids[lane] != PhotonId::NONE) {
+                let at = [0, 1, 2].map(|axis| block.position[axis][lane]);
+                let class = even.classify(&Place::ball(at, 1.0), &mut nearest, &mut room);
+                near += u32::from(matches!(class, Class::Penumbra(_)));
+                all += 1;
+            }
+        }
+        f64::from(near) / f64::from(all)
+    };
+    let rounds = store.by_light()[0];
+    let (before, after) = (share(rounds.map()), share(rounds.later().expect("later rounds")));
+    assert!(after > 1.2 * before && before > 0.05, "{before} {after}");
 }
 
 #[test]

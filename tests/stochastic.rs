@@ -16,6 +16,7 @@ use occlude_host::photons::BlockerKind;
 use occlude_host::render::{Limits, Rendered, render};
 use occlude_host::sampler::Pattern;
 use occlude_host::scene::{CameraRequest, Scene, load};
+use occlude_host::volumetric::Volumes;
 use occlude_kernel::Counts;
 use occlude_kernel::lanes::{detect, levels};
 use std::path::Path;
@@ -335,6 +336,7 @@ fn terms_over_a_map_have_its_expectation() {
                 };
                 let options = MapOptions {
                     lines: Some(20_000),
+                    rounds: 1,
                     k: 50,
                     radius: None,
                     // Few names leave a half empty, and learned terms without noise to test.
@@ -352,4 +354,90 @@ fn terms_over_a_map_have_its_expectation() {
             }
         }
     }
+}
+
+/// Trees over the halves, subtrees as halves, test rays by cells, photons in rounds and boxes in closed meshes, each and
+/// together: the expectation is that of the map with the same photons and boxes.
+#[test]
+fn every_remedy_keeps_the_expectation_of_the_map() {
+    let setting = Setting::of(generate(Kind::Spheres, 1, 2000), (48, 32));
+    let volumes = Volumes::build(&setting.scene, &setting.lights);
+    assert!(volumes.stats.boxes > 0);
+    let stage_of = |what: &dyn Fn(&Stage<'_>) -> PreparedMap| {
+        let camera = setting.scene.camera.expect("a camera");
+        let frame = camera.frame();
+        what(&Stage {
+            scene: &setting.scene,
+            bvh: setting.accel.bvh(),
+            lights: &setting.lights,
+            eye: camera.eye,
+            camera: &frame,
+            shadow_rays: SHADOW_RAYS,
+            pattern: Pattern::default(),
+            seed: 3,
+            level: detect(),
+            count: false,
+        })
+    };
+    let balanced = Settings { split: Split::Sorted, ..Settings::default() };
+    let (importance, optimal) = (Rule::Importance, Rule::Optimal);
+    let treelets = Settings { split: Split::Treelet, rule: importance, ..balanced };
+    let (triangle, treelet) = (BlockerKind::Triangle, BlockerKind::Treelet(16));
+    // Kind, settings, rounds, trees, cells, boxes.
+    let cases = [
+        (triangle, balanced, 1, true, false, false),
+        (triangle, balanced, 1, false, false, true),
+        (triangle, Settings { rule: importance, ..balanced }, 1, false, true, false),
+        (triangle, Settings { rule: importance, ..balanced }, 3, true, true, true),
+        (triangle, Settings { rule: optimal, quotas: true, ..balanced }, 3, true, true, true),
+        (treelet, treelets, 1, false, false, true),
+        (treelet, Settings { form: Form::InclusionExclusion, ..treelets }, 3, false, true, true),
+    ];
+    for (kind, settings, rounds, trees, cells, boxes) in cases {
+        let options = MapOptions {
+            lines: Some(10_000),
+            rounds,
+            k: 50,
+            radius: None,
+            blockers: kind,
+            quality: Quality::Medium,
+        };
+        let map = stage_of(&|stage| PreparedMap::new(stage, &options));
+        let with_all = || {
+            let occluders = if boxes { volumes.occluders() } else { Vec::new() };
+            let map = map.visibility().with_occluders(occluders);
+            if trees { map.with_trees().expect("of triangles") } else { map }
+        };
+        let mut terms = MapTerms::new(with_all(), settings, &setting.scene).expect("they go together");
+        if cells {
+            terms = terms.by_cells();
+        }
+        let difference = setting.render(&Terms(terms, with_all()), 32, 0, 0);
+        let (off, told) = worst(&setting, &difference, false);
+        println!("{settings}, {kind}, {rounds} rounds, trees {trees}, cells {cells}, boxes {boxes}: {told}");
+        assert!(
+            off < 5.0,
+            "{settings}, {kind}, {rounds} rounds, trees {trees}, cells {cells}, boxes {boxes}: {told}"
+        );
+    }
+    // Boxes left out on one side only are found.
+    let options = MapOptions {
+        lines: Some(2_000),
+        rounds: 1,
+        k: 50,
+        radius: None,
+        blockers: triangle,
+        quality: Quality::Medium,
+    };
+    let map = stage_of(&|stage| PreparedMap::new(stage, &options));
+    let boxed = map.visibility().with_occluders(volumes.occluders());
+    let quiet = Settings { form: Form::Residual, ..balanced };
+    let terms = MapTerms::new(boxed, quiet, &setting.scene).expect("they go together");
+    let (off, _) = worst(&setting, &setting.render(&Terms(terms, map.visibility()), 32, 0, 0), false);
+    assert!(off > 5.0, "{off}");
+    let said = MapTerms::new(map.visibility(), treelets, &setting.scene).expect_err("refused").to_string();
+    assert!(said.contains("--split sorted"), "{said}");
+    let alone =
+        Stochastic::new(treelets, &setting.scene, &setting.accel.bvh()).expect_err("refused").to_string();
+    assert!(alone.contains("--blockers map"), "{alone}");
 }

@@ -5,7 +5,12 @@
 //! nearer together than the clearance of the tree count as one, as they do for shadow rays.
 //!
 //! A line's numbers follow from the seed and its index, and results are joined in the order of the indices: any
-//! number of threads gives the same photons.
+//! number of threads gives the same photons. With several rounds ([`Shower::shoot_in_rounds`]) the first is even, and
+//! later ones go where shadows seem to begin and end.
+
+mod rounds;
+
+pub(crate) use rounds::{normal, scene_area};
 
 use crate::accel::{Accel, Quality};
 use crate::light::AreaLight;
@@ -13,12 +18,13 @@ use crate::sampler::Sampler;
 use crate::scene::Scene;
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
-use occlude_kernel::photons::{PhotonBlock, PhotonId, PhotonTree, Photons, Point, Split};
+use occlude_kernel::photons::{Nearest, Neighbour, PhotonBlock, PhotonId, PhotonTree, Photons, Point, Split};
 use occlude_kernel::{
     Bvh, Child, Hit, LightPhoton, NO_TRIANGLE, Native, OcclusionPhoton, PhotonMap, Ray, Simd, Uncounted,
     offset,
 };
 use rayon::prelude::*;
+use rounds::Cells;
 use std::f32::consts::TAU;
 use std::fmt;
 use std::ops::{ControlFlow, Range};
@@ -205,6 +211,10 @@ impl Shower<'_> {
     /// The first line of each light, and at the end the number of lines: in proportion to power, systematically, so
     /// that each count is within one of its due. Lights without power get none.
     pub fn shares(&self) -> Vec<u64> {
+        self.shares_of(self.lines)
+    }
+
+    fn shares_of(&self, lines: u64) -> Vec<u64> {
         let power: Vec<f64> =
             self.lights.iter().map(|light| f64::from(light.power().element_sum())).collect();
         let total: f64 = power.iter().sum();
@@ -213,7 +223,7 @@ impl Shower<'_> {
         for (i, power) in power.iter().enumerate() {
             sum += power;
             let share = if i + 1 == self.lights.len() || total <= 0.0 { 1.0 } else { sum / total };
-            firsts.push((share * self.lines as f64).round() as u64);
+            firsts.push((share * lines as f64).round() as u64);
         }
         firsts
     }
@@ -227,49 +237,159 @@ impl Shower<'_> {
     /// The same, and where on the light's unit square it starts.
     #[inline]
     pub fn ray_and_place(&self, line: u64, light: u32) -> (Ray, [f32; 2]) {
-        let light = &self.lights[light as usize];
+        let (ray, place, _) = self.even(line, light);
+        (ray, place)
+    }
+
+    /// The same, and the direction as the square of a radius and an angle.
+    #[inline]
+    fn even(&self, line: u64, light: u32) -> (Ray, [f32; 2], [f32; 2]) {
         let mut sampler = Sampler::new(self.seed, line, STREAM);
         let place = [sampler.uniform(), sampler.uniform()];
-        let y = light.point(place);
         let (across, angle) = (sampler.uniform(), TAU * sampler.uniform());
         let radius = across.sqrt();
+        let disc = [radius * angle.cos(), radius * angle.sin()];
+        (self.leave(light, place, disc, across), place, [across, angle])
+    }
+
+    /// The ray from a place, in the direction whose foot on the disc is this, at this squared distance.
+    #[inline]
+    fn leave(&self, light: u32, place: [f32; 2], disc: [f32; 2], across: f32) -> Ray {
+        let light = &self.lights[light as usize];
+        let y = light.point(place);
         let (u, v) = light.normal.any_orthonormal_pair();
-        let direction =
-            u * (radius * angle.cos()) + v * (radius * angle.sin()) + light.normal * (1.0 - across).sqrt();
-        (Ray::from(offset(y, light.normal, self.bvh.clearance()), direction), place)
+        let direction = u * disc[0] + v * disc[1] + light.normal * (1.0 - across).max(0.0).sqrt();
+        Ray::from(offset(y, light.normal, self.bvh.clearance()), direction)
+    }
+
+    /// The ray of a line, and the cell it leaves from if there are any.
+    fn ray_and_cell(&self, line: u64, light: u32, from: Source<'_>) -> (Ray, u32) {
+        match from {
+            Source::Anywhere(cells) => {
+                let (ray, place, [across, angle]) = self.even(line, light);
+                let cell = cells.map_or(0, |cells| cells.at(place, rounds::square(across.sqrt(), angle)));
+                (ray, cell)
+            }
+            Source::Cells { cells, first, count } => {
+                let mut sampler = Sampler::new(self.seed, line, STREAM);
+                let uniform = [0; 4].map(|_| sampler.uniform());
+                let (cell, place, direction) = cells.draw(line - first, count, uniform);
+                let disc = rounds::disc(direction);
+                (self.leave(light, place, disc, disc[0] * disc[0] + disc[1] * disc[1]), cell)
+            }
+        }
     }
 
     /// Shoots all lines and sorts what they leave, on the threads of the current pool.
     pub fn shoot(&self) -> PhotonStore {
+        self.shoot_all(1, None)
+    }
+
+    /// The same in rounds: half of the lines evenly, and the other half in equal rounds, each of them to where the photons
+    /// so far see shadows begin and end, or name different blockers. 0 rounds count as one.
+    ///
+    /// Later photons stand apart (see [`Photons::with_later`]). Costs, beside the lines, a look-up of 24 neighbours for
+    /// each photon and later round, and sorting as often.
+    pub fn shoot_in_rounds(&self, rounds: u32, scene: &Scene) -> PhotonStore {
+        self.shoot_all(rounds, Some(scene))
+    }
+
+    fn shoot_all(&self, rounds: u32, scene: Option<&Scene>) -> PhotonStore {
         let start = Instant::now();
-        let firsts = self.shares();
+        let many = self.lights.len();
+        let later = u64::from(rounds.saturating_sub(1)).min(self.lines / 2);
+        let scene = scene.filter(|_| later > 0);
+        let even = if scene.is_some() { self.lines - self.lines / 2 } else { self.lines };
+        let mut store = PhotonStore {
+            stats: ShowerStats { lines: self.lines, rounds: 1, ..Default::default() },
+            ..Default::default()
+        };
+        let firsts = self.shares_of(even);
+        let mut cells: Vec<Option<Cells>> =
+            firsts.windows(2).map(|part| scene.map(|_| Cells::new(part[1] - part[0]))).collect();
+        let mut ranges = vec![[Vec::new(), Vec::new()]; many];
+        let mut from = [Vec::new(), Vec::new()];
+        let anywhere = |light: usize| Source::Anywhere(cells[light].as_ref());
+        self.round(0, &firsts, anywhere, &mut store, &mut ranges, &mut from);
+        let evenly = ranges.clone();
+        let mut done = even;
+        if let Some(scene) = scene {
+            for round in 1..=later {
+                let judging = Instant::now();
+                let next = even + (self.lines - even) * round / later;
+                let firsts = self.shares_of(next - done);
+                for (light, cells) in cells.iter_mut().enumerate().filter_map(|(i, c)| Some((i, c.as_mut()?)))
+                {
+                    let photons = [&ranges[light][0][..], &ranges[light][1][..]];
+                    let of = [&from[0][..], &from[1][..]];
+                    let points = rounds::score(self, scene, &store, of, photons, cells.count());
+                    cells.divide(&points, firsts[light + 1] - firsts[light]);
+                }
+                store.stats.judged += judging.elapsed();
+                let in_cells = |light: usize| {
+                    let (first, count) = (done + firsts[light], firsts[light + 1] - firsts[light]);
+                    cells[light].as_ref().map_or(Source::Anywhere(None), |cells| Source::Cells {
+                        cells,
+                        first,
+                        count,
+                    })
+                };
+                self.round(done, &firsts, in_cells, &mut store, &mut ranges, &mut from);
+                store.stats.rounds += 1;
+                done = next;
+            }
+        }
+        store.stats.later_lines = self.lines - even;
+        store.stats.shot = start.elapsed() - store.stats.judged;
+
+        let start = Instant::now();
+        let (light, occlusion) = (&store.light, &store.occlusion);
+        let sort = |(all, even): (&Ranges, &Ranges)| {
+            let sorted = |skip: [usize; 2], take: [usize; 2]| {
+                let of = |kind: usize| &all[kind][skip[kind]..skip[kind] + take[kind]];
+                Sorted::new([of(0), of(1)], light, occlusion)
+            };
+            let evenly = [even[0].len(), even[1].len()];
+            let rest = [all[0].len() - evenly[0], all[1].len() - evenly[1]];
+            Tree { even: sorted([0; 2], evenly), later: sorted(evenly, rest) }
+        };
+        let trees = ranges.par_iter().zip(&evenly).map(sort).collect();
+        store.trees = trees;
+        store.stats.sorted = start.elapsed();
+        store
+    }
+
+    /// Shoots the lines of a round, those of each light from `firsts` on, and appends what they leave.
+    fn round<'c>(
+        &self,
+        base: u64,
+        firsts: &[u64],
+        from: impl Fn(usize) -> Source<'c> + Sync,
+        store: &mut PhotonStore,
+        ranges: &mut [Ranges],
+        cells: &mut [Vec<u32>; 2],
+    ) {
         let parts: Vec<(u32, Range<u64>)> = firsts
             .windows(2)
             .zip(0u32..)
             .flat_map(|(lines, light)| {
-                let (first, end) = (lines[0], lines[1]);
+                let (first, end) = (base + lines[0], base + lines[1]);
                 (first..end).step_by(CHUNK as usize).map(move |from| (light, from..end.min(from + CHUNK)))
             })
             .collect();
         let trails: Vec<Trails> = parts
             .par_iter()
             .map(|(light, lines)| {
-                dispatch(self.level, Cross { shower: self, light: *light, lines: lines.clone() })
+                let from = from(*light as usize);
+                dispatch(self.level, Cross { shower: self, light: *light, lines: lines.clone(), from })
             })
             .collect();
-        let shot = start.elapsed();
-
-        let start = Instant::now();
         let total = |size: fn(&Trails) -> usize| trails.iter().map(size).sum::<usize>();
-        let mut store = PhotonStore {
-            light: Vec::with_capacity(total(|t| t.light.len())),
-            occlusion: Vec::with_capacity(total(|t| t.occlusion.len())),
-            blockers: Vec::with_capacity(total(|t| t.blockers.len())),
-            trees: Vec::with_capacity(self.lights.len()),
-            stats: ShowerStats { lines: self.lines, shot, ..Default::default() },
-        };
+        store.light.reserve(total(|t| t.light.len()));
+        store.occlusion.reserve(total(|t| t.occlusion.len()));
+        store.blockers.reserve(total(|t| t.blockers.len()));
         let mut trails = trails.iter().zip(&parts).peekable();
-        for light in 0..self.lights.len() as u32 {
+        for light in 0..firsts.len() as u32 - 1 {
             let before = (store.light.len(), store.occlusion.len());
             while let Some((trail, _)) = trails.next_if(|(_, (of, _))| *of == light) {
                 let base = store.blockers.len() as u32;
@@ -278,18 +398,32 @@ impl Shower<'_> {
                     .occlusion
                     .extend(trail.occlusion.iter().map(|p| OcclusionPhoton { first: p.first + base, ..*p }));
                 store.blockers.extend_from_slice(&trail.blockers);
+                store
+                    .surfaces
+                    .iter_mut()
+                    .zip(&trail.surfaces)
+                    .for_each(|(to, from)| to.extend_from_slice(from));
+                cells.iter_mut().zip(&trail.cells).for_each(|(to, from)| to.extend_from_slice(from));
                 store.stats.dropped_blockers += trail.dropped_blockers;
                 store.stats.dropped_photons += trail.dropped_photons;
                 store.stats.lost += trail.lost;
             }
-            let ranges = (before.0..store.light.len(), before.1..store.occlusion.len());
-            store.trees.push(Tree { light: ranges.0, occlusion: ranges.1, ..Default::default() });
+            ranges[light as usize][0].push(before.0..store.light.len());
+            ranges[light as usize][1].push(before.1..store.occlusion.len());
         }
-        let (light, occlusion) = (&store.light, &store.occlusion);
-        store.trees.par_iter_mut().for_each(|tree| tree.sort(light, occlusion));
-        store.stats.sorted = start.elapsed();
-        store
     }
+}
+
+/// Light and occlusion photons of one light, a range a round.
+type Ranges = [Vec<Range<usize>>; 2];
+
+/// Where lines leave from.
+#[derive(Clone, Copy)]
+enum Source<'a> {
+    /// Evenly; into which cells that falls is told if there are any.
+    Anywhere(Option<&'a Cells>),
+    /// From the cells that are due most.
+    Cells { cells: &'a Cells, first: u64, count: u64 },
 }
 
 /// Builds a tree, each half of a large part in a thread of its own.
@@ -310,6 +444,10 @@ struct Trails {
     light: Vec<LightPhoton>,
     occlusion: Vec<OcclusionPhoton>,
     blockers: Vec<u32>,
+    /// The triangle of each photon, by kind.
+    surfaces: [Vec<u32>; 2],
+    /// The cell that each photon's line left from, by kind, if there are cells.
+    cells: [Vec<u32>; 2],
     dropped_blockers: u64,
     dropped_photons: u64,
     lost: u64,
@@ -320,6 +458,7 @@ struct Cross<'a> {
     shower: &'a Shower<'a>,
     light: u32,
     lines: Range<u64>,
+    from: Source<'a>,
 }
 
 impl Task for Cross<'_> {
@@ -332,13 +471,16 @@ impl Task for Cross<'_> {
         let mut hits: Vec<Hit> = Vec::new();
         let mut line = self.lines.start;
         while line < self.lines.end {
-            let ray = self.shower.ray(line, self.light);
+            let (ray, cell) = self.shower.ray_and_cell(line, self.light, self.from);
             hits.clear();
             bvh.each_hit(&ray, None, &mut Uncounted, |hit| {
                 hits.push(hit);
                 ControlFlow::Continue(())
             });
             trails.leave(self.shower, self.light, &ray, &mut hits);
+            if !matches!(self.from, Source::Anywhere(None)) {
+                trails.came_from(cell);
+            }
             line += 1;
         }
         trails
@@ -346,6 +488,12 @@ impl Task for Cross<'_> {
 }
 
 impl Trails {
+    /// Notes the cell of the photons that have none yet.
+    fn came_from(&mut self, cell: u32) {
+        self.cells[0].resize(self.light.len(), cell);
+        self.cells[1].resize(self.occlusion.len(), cell);
+    }
+
     /// Turns the hits of a line, in any order, into photons.
     fn leave(&mut self, shower: &Shower<'_>, light: u32, ray: &Ray, hits: &mut Vec<Hit>) {
         if hits.is_empty() {
@@ -366,6 +514,7 @@ impl Trails {
                 self.dropped_photons += 1;
             } else if photons == 0 {
                 self.light.push(LightPhoton { position, light });
+                self.surfaces[0].push(hits[at].triangle);
                 photons += 1;
             } else {
                 self.occlusion.push(OcclusionPhoton {
@@ -374,6 +523,7 @@ impl Trails {
                     first: first as u32,
                     len: known as u32,
                 });
+                self.surfaces[1].push(hits[at].triangle);
                 photons += 1;
             }
             while at < hits.len() && hits[at].t <= surface + clearance {
@@ -398,31 +548,49 @@ impl Trails {
     }
 }
 
-/// The photons of one light, sorted.
+/// The photons of one light, sorted: those of the first round, and those of later ones.
 #[derive(Clone, Debug, Default)]
 struct Tree {
-    light: Range<usize>,
-    occlusion: Range<usize>,
+    even: Sorted,
+    later: Sorted,
+}
+
+/// A map's memory.
+#[derive(Clone, Debug, Default)]
+struct Sorted {
     blocks: Vec<PhotonBlock>,
     splits: Vec<Split>,
 }
 
-impl Tree {
-    fn sort(&mut self, light: &[LightPhoton], occlusion: &[OcclusionPhoton]) {
-        let count = self.light.len() + self.occlusion.len();
-        self.blocks = vec![PhotonBlock::EMPTY; count.div_ceil(PhotonBlock::WIDTH)];
-        self.splits = vec![Split::NONE; self.blocks.len()];
-        let points = PhotonBlock::as_points(&mut self.blocks);
+impl Sorted {
+    /// Of ranges of light photons and of occlusion photons.
+    fn new(ranges: [&[Range<usize>]; 2], light: &[LightPhoton], occlusion: &[OcclusionPhoton]) -> Self {
+        let count: usize = ranges.iter().flat_map(|ranges| ranges.iter()).map(Range::len).sum();
+        let mut sorted = Self::default();
+        sorted.blocks = vec![PhotonBlock::EMPTY; count.div_ceil(PhotonBlock::WIDTH)];
+        sorted.splits = vec![Split::NONE; sorted.blocks.len()];
+        let points = PhotonBlock::as_points(&mut sorted.blocks);
         points.fill(Point::NONE);
-        let (first, rest) = points.split_at_mut(self.light.len());
-        for (point, i) in first.iter_mut().zip(self.light.clone()) {
-            *point = Point { position: light[i].position, id: PhotonId::light(i as u32) };
-        }
-        for (point, i) in rest.iter_mut().zip(self.occlusion.clone()) {
-            *point = Point { position: occlusion[i].position, id: PhotonId::occlusion(i as u32) };
-        }
-        build(&mut self.blocks, &mut self.splits);
+        let [first, rest] = ranges;
+        let first = first.iter().cloned().flatten();
+        let rest = rest.iter().cloned().flatten();
+        let all = first.map(|i| Point { position: light[i].position, id: PhotonId::light(i as u32) }).chain(
+            rest.map(|i| Point { position: occlusion[i].position, id: PhotonId::occlusion(i as u32) }),
+        );
+        points.iter_mut().zip(all).for_each(|(point, photon)| *point = photon);
+        build(&mut sorted.blocks, &mut sorted.splits);
+        sorted
     }
+
+    fn bytes(&self) -> usize {
+        size_of_val(&*self.blocks) + size_of_val(&*self.splits)
+    }
+}
+
+/// How far to look for the `k` nearest of this many photons: three times as far as they are on average, if they
+/// lay evenly on this area.
+fn reach(k: usize, area: f64, photons: usize) -> f32 {
+    (3.0 * (k as f64 * area / (std::f64::consts::PI * photons.max(1) as f64)).sqrt()) as f32
 }
 
 /// What a shower was like.
@@ -430,6 +598,10 @@ impl Tree {
 pub struct ShowerStats {
     /// Lines shot.
     pub lines: u64,
+    /// Rounds they were shot in, the even one counted.
+    pub rounds: u32,
+    /// Lines of the rounds after the even one.
+    pub later_lines: u64,
     /// Lines that met nothing.
     pub lost: u64,
     /// Names left out of lines that crossed more than [`MOST_BLOCKERS`].
@@ -438,16 +610,19 @@ pub struct ShowerStats {
     pub dropped_photons: u64,
     /// Time to shoot, on the clock.
     pub shot: Duration,
+    /// Time to find where later rounds should go, on the clock.
+    pub judged: Duration,
     /// Time to join and sort, on the clock.
     pub sorted: Duration,
 }
 
 /// All photons, sorted by light.
-#[derive(Clone, Debug)]
+#[derive(Clone, Debug, Default)]
 pub struct PhotonStore {
     light: Vec<LightPhoton>,
     occlusion: Vec<OcclusionPhoton>,
     blockers: Vec<u32>,
+    surfaces: [Vec<u32>; 2],
     trees: Vec<Tree>,
     /// How it came about.
     pub stats: ShowerStats,
@@ -469,30 +644,52 @@ impl PhotonStore {
         &self.blockers[photon.first as usize..(photon.first + photon.len) as usize]
     }
 
+    /// Where a photon is.
+    pub fn position(&self, id: PhotonId) -> [f32; 3] {
+        if id.is_light() { self.light[id.index()].position } else { self.occlusion[id.index()].position }
+    }
+
+    /// The triangle it lies on.
+    pub fn surface(&self, id: PhotonId) -> u32 {
+        self.surfaces[usize::from(!id.is_light())][id.index()]
+    }
+
     /// The photons of each light, to ask. Checks them, so ask for it once a render.
     pub fn by_light<'a>(&'a self) -> Vec<Photons<'a, Native>> {
+        let map = |sorted: &'a Sorted| {
+            PhotonMap::new(&sorted.blocks, &sorted.splits).expect("the builder keeps the kernel's rules")
+        };
         let photons = |tree: &'a Tree| {
-            let Tree { blocks, splits, .. } = tree;
-            let map = PhotonMap::new(blocks, splits).expect("the builder keeps the kernel's rules");
-            Photons::new(map, &self.occlusion, &self.blockers).expect("photons name what was kept")
+            let photons = Photons::new(map(&tree.even), &self.occlusion, &self.blockers);
+            photons
+                .and_then(|photons| photons.with_later(map(&tree.later)))
+                .expect("photons name what was kept")
         };
         self.trees.iter().map(photons).collect()
     }
 
-    /// How far to look for the `k` nearest photons of a light: three times as far as they are on average, if photons
-    /// lay evenly on this area.
+    /// How far to look for the `k` nearest photons of a light: three times as far as those of the first, even round are
+    /// on average, if they lay evenly on this area.
     pub fn radius(&self, light: usize, k: usize, area: f64) -> f32 {
-        let tree = &self.trees[light];
-        let photons = (tree.light.len() + tree.occlusion.len()).max(1);
-        (3.0 * (k as f64 * area / (std::f64::consts::PI * photons as f64)).sqrt()) as f32
+        let used = |block: &PhotonBlock| block.ids.iter().filter(|&&id| id != PhotonId::NONE).count();
+        reach(k, area, self.trees[light].even.blocks.iter().map(used).sum())
     }
 
     /// Bytes of all of it.
     pub fn bytes(&self) -> usize {
-        let trees = self.trees.iter().map(|tree| size_of_val(&*tree.blocks) + size_of_val(&*tree.splits));
+        let trees = self.trees.iter().map(|tree| tree.even.bytes() + tree.later.bytes());
         size_of_val(&*self.light)
             + size_of_val(&*self.occlusion)
             + size_of_val(&*self.blockers)
+            + self.surfaces.iter().map(|surfaces| size_of_val(&**surfaces)).sum::<usize>()
             + trees.sum::<usize>()
     }
 }
+
+/// Slots for a look-up: of the k nearest photons of the first round, and of up to four times as many of later ones.
+pub fn slots(k: usize) -> Vec<Neighbour> {
+    vec![Neighbour::NONE; Nearest::room(k) + Nearest::room(LATER * k)]
+}
+
+/// How many photons of later rounds count beside each of the first.
+const LATER: usize = 4;

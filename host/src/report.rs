@@ -97,6 +97,12 @@ pub struct Memory {
 pub struct MapFigures {
     /// Lines shot.
     pub lines: u64,
+    /// Whether later rounds went where shadows begin and end.
+    pub adaptive: bool,
+    /// Rounds they were shot in.
+    pub rounds: u32,
+    /// Lines of the rounds after the first, even one.
+    pub later_lines: u64,
     /// Lines that met nothing.
     pub lines_lost: u64,
     /// Photons on the first surface of a line.
@@ -113,6 +119,8 @@ pub struct MapFigures {
     pub k: usize,
     /// Shooting, s on the clock.
     pub shoot_s: f64,
+    /// Finding where later rounds should go, s on the clock.
+    pub judge_s: f64,
     /// Sorting, s on the clock.
     pub sort_s: f64,
     /// Bytes of the photons.

@@ -179,6 +179,13 @@ impl Place {
         }
     }
 
+    /// The same place, looked at no farther than the root of `square`.
+    #[inline(always)]
+    fn within(&self, square: f32) -> Self {
+        let radius = libm::sqrtf(square);
+        Self { radius: if radius < self.radius { radius } else { self.radius }, ..*self }
+    }
+
     /// The square of the radius; negative, so that nothing is near, if that is negative or NaN.
     #[inline(always)]
     fn reach(&self) -> f32 {
@@ -259,9 +266,13 @@ pub struct Blockers<'b> {
 }
 
 /// The photons of one light, both kinds in one map, and what they name.
+///
+/// Photons that were not shot evenly, but more of them where shadows seem to begin and end, stand in a map of their
+/// own ([`Photons::with_later`]).
 #[derive(Clone, Copy, Debug)]
 pub struct Photons<'a, S> {
     map: PhotonMap<'a, S>,
+    later: PhotonMap<'a, S>,
     occlusion: &'a [OcclusionPhoton],
     blockers: &'a [u32],
 }
@@ -288,49 +299,89 @@ impl<'a, S: Simd> Photons<'a, S> {
         occlusion: &'a [OcclusionPhoton],
         blockers: &'a [u32],
     ) -> Result<Self, PhotonsError> {
+        Self { map, later: map.without_photons(), occlusion, blockers }.checked(map)
+    }
+
+    /// The same with the photons of later rounds, of which more were shot here than there, sorted apart. They refer to
+    /// the same lists. Costs one look at them.
+    ///
+    /// How many photons of a kind are near a point then says nothing about how much of the light it sees, so the later
+    /// ones must not push even ones out of a look-up. The k nearest even photons are found first, and of the later
+    /// ones those that are as near as the k-th ([`Nearest`] says how many). A point is *lit* or *dark* if the even
+    /// photons say so and no later one objects: later photons turn calls into penumbrae and add names, and no point is
+    /// called wrongly that the even photons alone call rightly. Where no even photon is near, nothing is known.
+    pub fn with_later(self, later: PhotonMap<'a, S>) -> Result<Self, PhotonsError> {
+        Self { later, ..self }.checked(later)
+    }
+
+    fn checked(self, map: PhotonMap<'a, S>) -> Result<Self, PhotonsError> {
         for id in map.blocks().iter().flat_map(|block| block.ids) {
             if id != PhotonId::NONE && !id.is_light() {
-                let photon = occlusion.get(id.index());
+                let photon = self.occlusion.get(id.index());
                 let sound = photon.is_some_and(|photon| {
-                    u64::from(photon.first) + u64::from(photon.len) <= blockers.len() as u64
+                    u64::from(photon.first) + u64::from(photon.len) <= self.blockers.len() as u64
                 });
                 if !sound {
                     return Err(PhotonsError { photon: id.index() as u32 });
                 }
             }
         }
-        Ok(Self { map, occlusion, blockers })
+        Ok(self)
     }
 
     /// The same photons, asked with other vectors.
     #[inline(always)]
     pub fn on<T: Simd>(&self, simd: T) -> Photons<'a, T> {
-        Photons { map: self.map.on(simd), occlusion: self.occlusion, blockers: self.blockers }
+        let (map, later) = (self.map.on(simd), self.later.on(simd));
+        Photons { map, later, occlusion: self.occlusion, blockers: self.blockers }
     }
 
-    /// The map alone.
+    /// The map alone, of the photons shot evenly.
     #[inline]
     pub fn map(&self) -> PhotonMap<'a, S> {
         self.map
     }
 
+    /// The map of those of later rounds, if there are any.
+    #[inline]
+    pub fn later(&self) -> Option<PhotonMap<'a, S>> {
+        (!self.later.blocks().is_empty()).then_some(self.later)
+    }
+
     /// What the nearest photons say: of one kind, *lit* or *dark*; of both, *penumbra*, and `room` receives the
     /// blockers they name.
     ///
-    /// Costs a look-up, and in a penumbra the sorting of all names.
+    /// Costs a look-up, or two with [later](Photons::with_later) photons, and in a penumbra the sorting of all names.
     #[inline(always)]
     pub fn classify<'b>(&self, place: &Place, nearest: &mut Nearest<'_>, room: &'b mut [u32]) -> Class<'b> {
         self.map.nearest(place, nearest);
-        self.judge(nearest.found(), room)
+        let k = nearest.k();
+        let (found, more) = nearest.and_more();
+        let asked = !found.is_empty() && !self.later.blocks().is_empty();
+        let (Some(mut more), true) = (more, asked) else { return self.judge_all(found, &[], room) };
+        let mut reach = f32::INFINITY;
+        if found.len() == k {
+            reach = 0.0;
+            for neighbour in found {
+                reach = reach.max(neighbour.distance_squared());
+            }
+        }
+        self.later.nearest(&place.within(reach), &mut more);
+        self.judge_all(found, more.found(), room)
     }
 
     /// The same for photons already found.
     pub fn judge<'b>(&self, found: &[Neighbour], room: &'b mut [u32]) -> Class<'b> {
-        let light = found.iter().filter(|neighbour| neighbour.id().is_light()).count();
-        if found.is_empty() {
+        self.judge_all(found, &[], room)
+    }
+
+    fn judge_all<'b>(&self, even: &[Neighbour], later: &[Neighbour], room: &'b mut [u32]) -> Class<'b> {
+        let found = || even.iter().chain(later);
+        let light = found().filter(|neighbour| neighbour.id().is_light()).count();
+        if even.is_empty() {
             return Class::Unknown;
         }
-        if light == found.len() {
+        if light == even.len() + later.len() {
             return Class::Lit;
         }
         if light == 0 {
@@ -338,7 +389,7 @@ impl<'a, S: Simd> Photons<'a, S> {
         }
         // Sorted and without repetition are the first `neat` of the names.
         let (mut len, mut neat, mut dropped) = (0, 0, 0);
-        for neighbour in found {
+        for neighbour in found() {
             if neighbour.id().is_light() {
                 continue;
             }

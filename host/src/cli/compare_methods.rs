@@ -96,6 +96,7 @@ pub(super) fn run(args: &CompareMethodsArgs, level: Level) -> Result<Ended> {
     };
     let options = MapOptions {
         lines: None,
+        rounds: 1,
         k: 50,
         radius: None,
         blockers: BlockerKind::default(),

@@ -17,11 +17,16 @@ pub struct MapArgs {
     #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
     photons: Option<u64>,
 
+    /// Rounds to shoot them in. 1 shoots evenly; of more, the first half is even, and the rest goes where photons saw
+    /// shadows begin and end, or blockers that few of them named [default: 1].
+    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
+    photon_rounds: Option<u32>,
+
     /// Photons to look up around a point [default: 50].
     #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..=100_000))]
     photon_k: Option<u32>,
 
-    /// How far to look for them [default: three times as far as they are on average].
+    /// How far to look for them [default: three times as far as those of the even round are on average].
     #[arg(long, value_name = "R", value_parser = radius)]
     photon_radius: Option<f32>,
 
@@ -29,6 +34,11 @@ pub struct MapArgs {
     /// subtree of the scene's tree with at most SIZE triangles) [default: treelet:128].
     #[arg(long, value_name = "KIND")]
     blocker_kind: Option<BlockerKind>,
+
+    /// A tree over the triangles that photons name, built for each point and light, as the thesis does; with --method
+    /// stochastic one over each half of them. Photons then name triangles.
+    #[arg(long)]
+    blocker_trees: bool,
 
     /// Of --method stochastic, what is in the groups: all of the scene (the default), or what the photons of a map
     /// name. With --method map, short for --blocker-kind.
@@ -69,9 +79,11 @@ impl MapArgs {
     pub fn given(&self) -> Option<&'static str> {
         let given = [
             (self.photons.is_some(), "--photons"),
+            (self.photon_rounds.is_some(), "--photon-rounds"),
             (self.photon_k.is_some(), "--photon-k"),
             (self.photon_radius.is_some(), "--photon-radius"),
             (self.blocker_kind.is_some(), "--blocker-kind"),
+            (self.blocker_trees, "--blocker-trees"),
         ];
         given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
     }
@@ -79,6 +91,11 @@ impl MapArgs {
     /// Whether `--blockers` was given.
     pub fn names_blockers(&self) -> bool {
         self.blockers.is_some()
+    }
+
+    /// Whether trees are built over what photons name.
+    pub fn builds_trees(&self) -> bool {
+        self.blocker_trees
     }
 
     /// What they ask for.
@@ -99,13 +116,13 @@ impl MapArgs {
             (Some(Asked::Kind(kind)), None) => Some(kind),
             (_, kind) => kind,
         };
-        Ok(self.of_kind(kind, quality))
+        self.of_kind(kind, quality)
     }
 
     /// The map that `--method stochastic` is to ask, if any.
     pub fn below_stochastic(&self, quality: Quality) -> Result<Option<MapOptions>> {
         match (self.blockers, self.given()) {
-            (Some(Asked::Map), _) => Ok(Some(self.of_kind(self.blocker_kind, quality))),
+            (Some(Asked::Map), _) => self.of_kind(self.blocker_kind, quality).map(Some),
             (Some(Asked::Kind(kind)), _) => Err(Error::Usage(format!(
                 "--blockers is all or map with --method stochastic: give --blockers map --blocker-kind {kind}"
             ))),
@@ -116,14 +133,25 @@ impl MapArgs {
         }
     }
 
-    fn of_kind(&self, kind: Option<BlockerKind>, quality: Quality) -> MapOptions {
-        MapOptions {
+    fn of_kind(&self, kind: Option<BlockerKind>, quality: Quality) -> Result<MapOptions> {
+        let kind = match kind {
+            Some(BlockerKind::Treelet(_) | BlockerKind::Object) if self.blocker_trees => {
+                return Err(Error::Usage(
+                    "--blocker-trees builds trees over triangles: give --blocker-kind triangle with it, or no kind"
+                        .into(),
+                ));
+            }
+            None if self.blocker_trees => Some(BlockerKind::Triangle),
+            kind => kind,
+        };
+        Ok(MapOptions {
             lines: self.photons,
+            rounds: self.photon_rounds.unwrap_or(1),
             k: self.photon_k.unwrap_or(50) as usize,
             radius: self.photon_radius,
             blockers: kind.unwrap_or_default(),
             quality,
-        }
+        })
     }
 }
 

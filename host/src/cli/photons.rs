@@ -13,7 +13,7 @@ use crate::{light, output, scene};
 use clap::{Args, ValueEnum};
 use glam::Vec3;
 use occlude_kernel::lanes::Level;
-use occlude_kernel::photons::{Class, Nearest, Neighbour};
+use occlude_kernel::photons::{Class, Nearest};
 use occlude_kernel::{Counts, Ray, Uncounted};
 use std::path::PathBuf;
 use std::sync::atomic::AtomicBool;
@@ -98,8 +98,16 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     };
     let prepared = map::prepare(&stage, &args.map.options(args.quality)?, args.threads.into())?;
     let store = &prepared.store;
+    let rounds = match store.stats.rounds {
+        1 => "evenly".to_owned(),
+        rounds => format!(
+            "adaptively in {rounds} rounds ({} lines after the first, {:.3} s to find where)",
+            store.stats.later_lines,
+            store.stats.judged.as_secs_f64()
+        ),
+    };
     note(&format!(
-        "{} lines: {} light and {} occlusion photons, shot in {:.3} s, sorted in {:.3} s",
+        "{} lines: {} light and {} occlusion photons, shot {rounds} in {:.3} s, sorted in {:.3} s",
         store.stats.lines,
         store.light().len(),
         store.occlusion().len(),
@@ -199,7 +207,7 @@ fn dotted(stage: &Stage<'_>, mut image: Image, points: &[([f32; 3], Vec3)]) -> I
 /// Draws what the photons say about every pixel, and where a look shows that it is wrong.
 fn classified(stage: &Stage<'_>, prepared: &PreparedMap, mut image: Image) -> Image {
     let photons = prepared.store.by_light();
-    let mut slots = vec![Neighbour::NONE; Nearest::room(prepared.k())];
+    let mut slots = crate::photons::slots(prepared.k());
     let mut nearest = Nearest::new(prepared.k(), &mut slots).expect("room for k");
     let mut room = vec![0; 8192];
     let mut estimates = Vec::new();

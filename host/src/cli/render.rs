@@ -5,9 +5,10 @@ use super::{Ended, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, Form, MapOptions, MapTerms, Rule, Settings, Split, Stage, Stochastic,
+    Auto, AutoOptions, Exact, Form, Map, MapOptions, MapTerms, Rule, Settings, Split, Stage, Stochastic,
     Visibility, Walled,
 };
+use crate::photons::BlockerKind;
 use crate::render::{Limits, render, render_adaptively};
 use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
 use crate::sampler::Pattern;
@@ -46,7 +47,8 @@ pub struct RenderArgs {
     method: Method,
 
     /// Boxes inside closed meshes, which block rays without a look at triangles. The exact method gives the same image
-    /// with and without; the map misses fewer blockers with them [default: off for exact, on for map].
+    /// with and without; the map misses fewer blockers with them [default: off for exact, on for map and for stochastic
+    /// with --blockers map].
     #[arg(long, value_enum, value_name = "SWITCH")]
     volumetric: Option<Switch>,
 
@@ -126,6 +128,20 @@ struct StochasticArgs {
     /// Of the shadow rays of a point and light, exactly the right share takes each term.
     #[arg(long)]
     quotas: bool,
+
+    /// Where the 64 test rays start that say what probabilities should be: anew at each point, or with --blockers map once
+    /// for each cell of a grid over the map, whose points share them [default: point].
+    #[arg(long, value_enum, value_name = "WHERE")]
+    test_rays: Option<TestRays>,
+}
+
+/// What test rays are shot for.
+#[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
+enum TestRays {
+    /// For each point and light.
+    Point,
+    /// For each cell of the map and light.
+    Cell,
 }
 
 impl StochasticArgs {
@@ -137,14 +153,37 @@ impl StochasticArgs {
             (self.split.is_some(), "--split"),
             (self.levels.is_some(), "--levels"),
             (self.quotas, "--quotas"),
+            (self.test_rays.is_some(), "--test-rays"),
         ];
         given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
     }
 
-    fn settings(&self) -> Result<Settings> {
+    /// With or without a map.
+    fn settings(&self, map: Option<&MapOptions>) -> Result<Settings> {
+        let rule = self.probabilities.unwrap_or_default();
+        if self.test_rays.is_some() && rule == Rule::Uniform {
+            return Err(Error::Usage(
+                "--test-rays wants --probabilities importance or optimal: uniform ones need no test rays"
+                    .into(),
+            ));
+        }
+        if self.test_rays == Some(TestRays::Cell) && map.is_none() {
+            return Err(Error::Usage(
+                "--test-rays cell wants --blockers map: the cells are the map's".into(),
+            ));
+        }
+        if let (Some(Split::Treelet), Some(map)) = (self.split, map)
+            && !matches!(map.blockers, BlockerKind::Treelet(_))
+        {
+            return Err(Error::Usage(format!(
+                "--split treelet halves subtrees of the scene's tree, and photons name {}: give --blocker-kind \
+                 treelet:128, or --split sorted",
+                map.blockers
+            )));
+        }
         Settings {
             form: self.decomposition.unwrap_or_default(),
-            rule: self.probabilities.unwrap_or_default(),
+            rule,
             split: self.split.unwrap_or_default(),
             groups: self.levels.unwrap_or(2),
             quotas: self.quotas,
@@ -239,26 +278,34 @@ impl Chosen {
                 "{option} is an option of --method map, or of --method stochastic with --blockers map"
             )));
         }
-        if matches!(args.method, Method::Stochastic | Method::Auto) && args.volumetric.is_some() {
-            return Err(Error::Usage("--volumetric is an option of --method exact and map".to_owned()));
+        let no_map = args.method == Method::Stochastic && args.map.below_stochastic(args.quality)?.is_none();
+        if (no_map || args.method == Method::Auto) && args.volumetric.is_some() {
+            return Err(Error::Usage(
+                "--volumetric is an option of --method exact and map, and of stochastic with --blockers map"
+                    .to_owned(),
+            ));
         }
         Ok(match args.method {
             Method::Exact => Self::Exact,
             Method::Stochastic => match args.map.below_stochastic(args.quality)? {
-                None => Self::Stochastic(args.stochastic.settings()?),
-                Some(options) => Self::MapTerms(MapTerms::checked(args.stochastic.settings()?)?, options),
+                None => Self::Stochastic(args.stochastic.settings(None)?),
+                Some(options) => {
+                    Self::MapTerms(MapTerms::checked(args.stochastic.settings(Some(&options))?)?, options)
+                }
             },
             Method::Map => Self::Map(args.map.options(args.quality)?),
             Method::Auto => Self::Auto(AutoOptions::default()),
         })
     }
 
-    fn name(&self) -> String {
+    fn name(&self, args: &RenderArgs) -> String {
+        let trees = if args.map.builds_trees() { ", trees" } else { "" };
+        let cells = if args.stochastic.test_rays == Some(TestRays::Cell) { ", by cells" } else { "" };
         match self {
             Self::Exact => "exact".to_owned(),
             Self::Stochastic(settings) => format!("stochastic {settings}"),
-            Self::MapTerms(settings, _) => format!("map + stochastic {settings}"),
-            Self::Map(_) => "map".to_owned(),
+            Self::MapTerms(settings, _) => format!("map + stochastic {settings}{trees}{cells}"),
+            Self::Map(_) => format!("map{trees}"),
             Self::Auto(_) => "auto".to_owned(),
         }
     }
@@ -355,17 +402,23 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     }
     let volumetric = match (&chosen, args.volumetric) {
         (_, Some(switch)) => switch == Switch::On,
-        (chosen, None) => matches!(chosen, Chosen::Map(_)),
+        (chosen, None) => matches!(chosen, Chosen::Map(_) | Chosen::MapTerms(..)),
     };
     let volumes = volumetric.then(|| map::volumes(&scene, &lights, args.threads.into())).transpose()?;
     let occluders = volumes.as_ref().map(Volumes::occluders).unwrap_or_default();
     let mut map = prepared.as_ref().map(|prepared| prepared.visibility().with_occluders(occluders.clone()));
-    let terms = match (&chosen, &mut map) {
+    if args.map.builds_trees() {
+        map = map.map(Map::with_trees).transpose()?;
+    }
+    let mut terms = match (&chosen, &mut map) {
         (Chosen::MapTerms(settings, _), map) => {
             map.take().map(|map| MapTerms::new(map, *settings, &scene)).transpose()?
         }
         _ => None,
     };
+    if args.stochastic.test_rays == Some(TestRays::Cell) {
+        terms = terms.map(MapTerms::by_cells);
+    }
     let map = terms.as_ref().map(MapTerms::map).or(map.as_ref());
     let walled = volumes.is_some().then(|| Walled::new(occluders));
     let method: &dyn Visibility = match (&stochastic, &terms, map, &auto, &walled) {
@@ -402,7 +455,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     let seconds = |time: Duration| time.as_secs_f64();
     let report = Report {
         scene: scene.name.clone(),
-        method: chosen.name(),
+        method: chosen.name(args),
         size: [size.0, size.1],
         spp: rendered.passes,
         shadow_rays: args.shadow_rays,

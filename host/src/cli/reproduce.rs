@@ -27,9 +27,10 @@ enum What {
     ///
     /// Everything on it is run anew. Takes some minutes; nothing but this program is needed.
     Theory(TheoryArgs),
-    /// The occlusion map: time, tests, error and bias, and the thesis' table beside ours, as a page.
+    /// The occlusion map: time, tests, error and bias, each remedy alone and all together, and the thesis' table beside
+    /// ours, as a page.
     ///
-    /// Everything on it is run anew. Takes some minutes.
+    /// Everything on it is run anew. Takes ten minutes and more; --quick: one.
     Map(MapPageArgs),
 }
 

@@ -7,19 +7,23 @@
 //! Biased: what the photons miss casts no shadow, and thin shadows and slits of light can be lost. It is the thesis'
 //! method; the exact one is [`Exact`](super::Exact).
 
+mod cells;
 mod terms;
 
 pub use terms::MapTerms;
 
 use super::{Questions, ShadingPoint, Stage, Visibility};
 use crate::accel::Quality;
+use crate::error::{Error, Result};
 use crate::light::AreaLight;
-use crate::photons::{BlockerKind, BlockerSet, PhotonStore, Shower, default_lines};
+use crate::photons::{self, BlockerKind, BlockerSet, PhotonStore, Shower, default_lines};
 use crate::report::MapFigures;
+use occlude_kernel::bvh::{SmallTree, SmallTriangle};
 use occlude_kernel::lanes::{Task, dispatch};
-use occlude_kernel::photons::{Class, Nearest, Neighbour, Photons, Place};
+use occlude_kernel::photons::{Class, Nearest, Photons, Place};
 use occlude_kernel::{
-    BatchScratch, Bvh, Child, Counter, Counts, Native, Occluders, Simd, Targets, TriangleBlock, Uncounted,
+    BatchScratch, Bvh, Child, Counter, Counts, Native, Node, Occluders, Simd, Targets, TriangleBlock,
+    Uncounted,
 };
 use std::f32::consts::FRAC_1_PI;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -37,6 +41,8 @@ pub struct MapOptions {
     pub lines: Option<u64>,
     /// Photons to look up.
     pub k: usize,
+    /// Rounds to shoot them in; 1 shoots evenly, and of more the later ones go where shadows begin and end.
+    pub rounds: u32,
     /// How far to look; from the density of the photons if not given.
     pub radius: Option<f32>,
     /// What photons name.
@@ -64,12 +70,9 @@ impl PreparedMap {
         let blockers = BlockerSet::new(options.blockers, scene, &stage.bvh, options.quality);
         let lines = options.lines.unwrap_or_else(|| default_lines(scene.triangles.len()));
         let (bvh, lights, seed, level) = (stage.bvh, stage.lights, stage.seed, stage.level);
-        let store = Shower { bvh, lights, blockers: &blockers, lines, seed, level }.shoot();
-        let area = |triangle: u32| {
-            let [a, b, c] = scene.vertices(triangle).map(|v| v.as_dvec3());
-            0.5 * (b - a).cross(c - a).length()
-        };
-        let area: f64 = (0..scene.triangles.len() as u32).map(area).sum();
+        let shower = Shower { bvh, lights, blockers: &blockers, lines, seed, level };
+        let store = shower.shoot_in_rounds(options.rounds, scene);
+        let area = photons::scene_area(scene);
         let radius = |light| options.radius.unwrap_or_else(|| store.radius(light, options.k, area));
         let radii = (0..lights.len()).map(radius).collect();
         Self { store, blockers, kind: options.blockers, k: options.k, radii }
@@ -82,7 +85,8 @@ impl PreparedMap {
             _ => Vec::new(),
         };
         let photons = self.store.by_light();
-        Map { prepared: self, photons, objects, occluders: Vec::new(), classes: Default::default() }
+        let ways = Ways::default();
+        Map { prepared: self, photons, objects, occluders: Vec::new(), ways, classes: Default::default() }
     }
 
     /// Where to look for the photons of a light around a point of a surface.
@@ -97,6 +101,9 @@ impl PreparedMap {
         let [lit, dark, penumbra, unknown] = map.classes().get();
         MapFigures {
             lines: stats.lines,
+            adaptive: stats.rounds > 1,
+            rounds: stats.rounds,
+            later_lines: stats.later_lines,
             lines_lost: stats.lost,
             light_photons: store.light().len(),
             occlusion_photons: store.occlusion().len(),
@@ -105,6 +112,7 @@ impl PreparedMap {
             blockers: self.kind.to_string(),
             k: self.k,
             shoot_s: stats.shot.as_secs_f64(),
+            judge_s: stats.judged.as_secs_f64(),
             sort_s: stats.sorted.as_secs_f64(),
             bytes: store.bytes(),
             lit,
@@ -138,13 +146,43 @@ pub struct Map<'a> {
     photons: Vec<Photons<'a, Native>>,
     objects: Vec<Bvh<'a>>,
     occluders: Vec<Occluders<'a>>,
+    ways: Ways,
     classes: Classes,
+}
+
+/// How what photons name is asked.
+#[derive(Clone, Copy, Debug, Default)]
+struct Ways {
+    /// Whether a tree is built over the triangles.
+    trees: bool,
+    /// Whether every ray is traced by itself.
+    alone: bool,
 }
 
 impl<'a> Map<'a> {
     /// With boxes that block the light of each light, whatever photons name (see [`crate::volumetric`]).
     pub fn with_occluders(self, occluders: Vec<Occluders<'a>>) -> Self {
         Self { occluders, ..self }
+    }
+
+    /// With a tree over the triangles that photons name, built for each point and light ([`SmallTree`]); an error if they
+    /// name anything else.
+    pub fn with_trees(mut self) -> Result<Self> {
+        if !matches!(self.prepared.blockers, BlockerSet::Triangles) {
+            return Err(Error::Usage(format!(
+                "--blocker-trees builds trees over triangles, and photons name {}: give --blocker-kind triangle",
+                self.prepared.kind
+            )));
+        }
+        self.ways.trees = true;
+        Ok(self)
+    }
+
+    /// With every shadow ray traced by itself, and not all of a point at once. The same answers, slower: as the thesis
+    /// did it, for comparison.
+    pub fn one_by_one(mut self) -> Self {
+        self.ways.alone = true;
+        self
     }
 
     /// What the batches asked so far were.
@@ -190,10 +228,10 @@ impl<C: Counter> Task for Ask<'_, C> {
         let Self { map, stage, questions, estimates, counter } = self;
         let prepared = map.prepared;
         let bvh = stage.bvh.on(simd);
-        let mut slots = vec![Neighbour::NONE; Nearest::room(prepared.k)];
+        let mut slots = photons::slots(prepared.k);
         let mut nearest = Nearest::new(prepared.k, &mut slots).expect("room for k");
         let mut room = vec![0; ROOM];
-        let mut tracer = Tracer::new();
+        let mut tracer = Tracer::new(map.ways);
         let mut blocked = [0u64; MOST / 64];
         let mut hidden = [0u64; MOST / 64];
         let mut classes = [0; 4];
@@ -203,8 +241,8 @@ impl<C: Counter> Task for Ask<'_, C> {
             let light = &stage.lights[batch.light as usize];
             let samples = batch.samples.start as usize..batch.samples.end as usize;
             let place = prepared.place(batch.light as usize, point.x, point.normal);
-            let photons = map.photons[batch.light as usize].on(simd);
-            let class = photons.classify(&place, &mut nearest, &mut room);
+            let near = map.photons[batch.light as usize].on(simd);
+            let class = near.classify(&place, &mut nearest, &mut room);
             let list = match class {
                 Class::Lit => {
                     let each = lit(light, point, &questions.weights[samples.clone()], batch.share);
@@ -280,27 +318,49 @@ const MOST: usize = 256;
 
 /// Shadow rays against a list of blockers.
 struct Tracer {
+    ways: Ways,
     blocks: Vec<TriangleBlock>,
     roots: Vec<Child>,
+    few: Vec<SmallTriangle>,
+    nodes: Vec<Node>,
+    /// Nodes and blocks of the tree over the list, if there is one.
+    grown: Option<(usize, usize)>,
     scratch: BatchScratch,
 }
 
 impl Tracer {
-    fn new() -> Self {
-        Self { blocks: Vec::new(), roots: Vec::new(), scratch: BatchScratch::new() }
+    fn new(ways: Ways) -> Self {
+        Self {
+            ways,
+            blocks: Vec::new(),
+            roots: Vec::new(),
+            few: Vec::new(),
+            nodes: Vec::new(),
+            grown: None,
+            scratch: BatchScratch::new(),
+        }
     }
 
-    /// Gathers what a list names: triangles by eights, or subtrees.
+    /// Gathers what a list names: triangles by eights or as a tree, or subtrees.
     fn aim_at(&mut self, blockers: &BlockerSet, stage: &Stage<'_>, list: &[u32]) {
+        let corners = |triangle| stage.scene.vertices(triangle).map(|corner| corner.to_array());
         self.blocks.clear();
         self.roots.clear();
+        self.grown = None;
         match blockers {
+            BlockerSet::Triangles if self.ways.trees && !list.is_empty() => {
+                self.few.clear();
+                self.few.extend(list.iter().map(|&id| SmallTriangle { corners: corners(id), id }));
+                self.nodes.resize(SmallTree::nodes(list.len()), Node::EMPTY);
+                self.blocks.resize(SmallTree::blocks(list.len()), TriangleBlock::EMPTY);
+                let tree = SmallTree::new(&mut self.few, &mut self.nodes, &mut self.blocks);
+                self.grown = tree.map(SmallTree::build);
+            }
             BlockerSet::Triangles => {
                 for eight in list.chunks(TriangleBlock::WIDTH) {
                     let mut block = TriangleBlock::EMPTY;
                     for (lane, &triangle) in eight.iter().enumerate() {
-                        let corners = stage.scene.vertices(triangle).map(|corner| corner.to_array());
-                        block.set(lane, corners, triangle);
+                        block.set(lane, corners(triangle), triangle);
                     }
                     self.roots.push(Child::leaf(self.blocks.len() as u32));
                     self.blocks.push(block);
@@ -313,9 +373,39 @@ impl Tracer {
         }
     }
 
+    /// Asks what a list names; `blocked` has a bit for each target.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn trace<S: Simd>(
+        &mut self,
+        blockers: (&BlockerSet, &[Bvh<'_>]),
+        (simd, bvh): (S, Bvh<'_, S>),
+        list: &[u32],
+        x: [f32; 3],
+        targets: &Targets<'_>,
+        counter: &mut impl Counter,
+        blocked: &mut [u64],
+    ) {
+        if !self.ways.alone {
+            self.trace_all(blockers, (simd, bvh), list, x, targets, counter, blocked);
+            return;
+        }
+        blocked.fill(0);
+        let mut i = 0;
+        while i < targets.len() {
+            let [tx, ty, tz] = targets.get(i).to_array();
+            if let Some(one) = Targets::new(&[tx], &[ty], &[tz]) {
+                let mut word = [0u64];
+                self.trace_all(blockers, (simd, bvh), list, x, &one, counter, &mut word);
+                blocked[i / 64] |= word[0] << (i % 64);
+            }
+            i += 1;
+        }
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn trace_all<S: Simd>(
         &mut self,
         (blockers, objects): (&BlockerSet, &[Bvh<'_>]),
         (simd, bvh): (S, Bvh<'_, S>),
@@ -327,7 +417,15 @@ impl Tracer {
     ) {
         let (roots, scratch) = (&self.roots, &mut self.scratch);
         let (tree, roots) = match blockers {
-            BlockerSet::Triangles => (bvh.with_blocks(&self.blocks), &roots[..]),
+            BlockerSet::Triangles => {
+                if let Some((nodes, blocks)) = self.grown {
+                    let tree = bvh.with_small(&self.nodes[..nodes], &self.blocks[..blocks]);
+                    let tree = tree.expect("the builder keeps the kernel's rules");
+                    tree.occluded_batch(x, targets, None, counter, scratch, blocked);
+                    return;
+                }
+                (bvh.with_blocks(&self.blocks), &roots[..])
+            }
             BlockerSet::Treelets(..) => (bvh, &roots[..]),
             BlockerSet::Objects(..) => {
                 // Trees of their own, each asked about what the others leave.

@@ -29,12 +29,14 @@ mod pyramid;
 mod shaft;
 mod single;
 mod slabs;
+mod small;
 mod tile;
 
 pub use batch::{BatchScratch, Targets};
 pub use occluders::Occluders;
 pub use packet::HitPacket;
 pub use part::Part;
+pub use small::{SmallTree, SmallTriangle};
 pub use tile::{TilePoint, TileScratch};
 
 use crate::lanes::{Native, Simd};

@@ -38,9 +38,13 @@ impl Neighbour {
 ///
 /// No heap: what comes near enough is appended, and when the slice is full the k nearest are selected, which also
 /// says how near the next must be. A photon so costs a constant time on average, and not the logarithm of k.
+///
+/// Slots beyond [`room(k)`](Self::room) are for the photons of later rounds
+/// ([`Photons::with_later`](super::Photons::with_later)): with `room(k) + room(m)` slots up to m of them count.
 #[derive(Debug)]
 pub struct Nearest<'a> {
     slots: &'a mut [Neighbour],
+    spare: &'a mut [Neighbour],
     k: usize,
     len: usize,
     full: usize,
@@ -56,7 +60,8 @@ impl<'a> Nearest<'a> {
     /// For the `k` nearest, in at least [`room(k)`](Self::room) slots; `None` if there are fewer.
     pub fn new(k: usize, slots: &'a mut [Neighbour]) -> Option<Self> {
         let room = Self::room(k);
-        if slots.len() < room { None } else { Some(Self { slots, k, len: 0, full: room, reach: -1.0 }) }
+        let (slots, spare) = slots.split_at_mut_checked(room)?;
+        Some(Self { slots, spare, k, len: 0, full: room, reach: -1.0 })
     }
 
     /// How many are looked for.
@@ -69,6 +74,14 @@ impl<'a> Nearest<'a> {
     #[inline]
     pub fn found(&self) -> &[Neighbour] {
         &self.slots[..self.len]
+    }
+
+    /// The neighbours found, and room for as many more as the spare slots hold; `None` if that is no photon.
+    #[inline(always)]
+    pub(super) fn and_more(&mut self) -> (&[Neighbour], Option<Nearest<'_>>) {
+        let k = self.spare.len().saturating_sub(SPARE) / 2;
+        let more = if k > 0 { Nearest::new(k, self.spare) } else { None };
+        (&self.slots[..self.len], more)
     }
 
     /// The same, the nearest first.

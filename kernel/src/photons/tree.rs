@@ -174,6 +174,12 @@ impl<'a, S: Simd> PhotonMap<'a, S> {
         PhotonMap { blocks: self.blocks, splits: self.splits, simd }
     }
 
+    /// A map that holds nothing.
+    #[inline(always)]
+    pub(super) fn without_photons(&self) -> Self {
+        Self { blocks: &[], splits: &[], simd: self.simd }
+    }
+
     /// The photons.
     #[inline]
     pub fn blocks(&self) -> &'a [PhotonBlock] {

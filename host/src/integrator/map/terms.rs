@@ -3,18 +3,24 @@
 //! Lit and dark are as in [`Map`](super::Map). In a penumbra the names stand in two halves, drawn or sorted by distance
 //! for each point and light, and a shadow ray asks the halves that its random term wants. The estimates have the
 //! expectation of [`Map`](super::Map), which is biased, and may be negative or above one.
+//!
+//! The terms' probabilities may come from test rays, for each point and light or for each cell of a grid over the map; any
+//! probabilities are right on average that do not depend on the samples they choose for, and these do not.
 
 use super::super::stochastic::{TEST_RAYS, learned};
 use super::super::{Batch, Questions, ShadingPoint, Split, Stage, Visibility};
-use super::{MOST, Map, ROOM, Tests, Tracer, lit};
+use super::cells::Cells;
+use super::{MOST, Map, PreparedMap, ROOM, Tests, Tracer, lit};
 use crate::error::{Error, Result};
 use crate::integrator::{Rule, Settings};
+use crate::light::AreaLight;
+use crate::photons::{self, BlockerSet};
 use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::{Task, dispatch};
-use occlude_kernel::photons::{Class, Nearest, Neighbour};
+use occlude_kernel::photons::{Class, Nearest, PhotonId};
 use occlude_kernel::{
-    Counter, Counts, OneTerm, Probabilities, Quotas, Simd, Tally, Targets, Uncounted, offset,
+    Bvh, Counter, Counts, OneTerm, Probabilities, Quotas, Simd, Tally, Targets, Uncounted, offset,
 };
 use std::sync::atomic::Ordering;
 
@@ -26,6 +32,8 @@ pub struct MapTerms<'a> {
     fixed: OneTerm,
     /// The middle of each blocker, if they are sorted.
     middles: Vec<Vec3>,
+    /// Of each light, if probabilities are learned by cells.
+    cells: Option<Vec<Cells>>,
 }
 
 impl<'a> MapTerms<'a> {
@@ -39,7 +47,7 @@ impl<'a> MapTerms<'a> {
         let blockers = &map.prepared.blockers;
         let triangles = scene.triangles.len();
         let mut middles = Vec::new();
-        if settings.split == Split::Sorted {
+        if settings.split != Split::Random {
             let mut sums = vec![(Vec3::ZERO, 0.0f32); blockers.count(triangles)];
             for triangle in 0..triangles as u32 {
                 let (sum, count) = &mut sums[blockers.of(triangle) as usize];
@@ -48,7 +56,21 @@ impl<'a> MapTerms<'a> {
             }
             middles = sums.iter().map(|(sum, count)| *sum / count.max(1.0)).collect();
         }
-        Ok(Self { map, settings, fixed, middles })
+        if settings.split == Split::Treelet && !matches!(blockers, BlockerSet::Treelets(..)) {
+            return Err(Error::Usage(format!(
+                "--split treelet halves subtrees of the scene's tree, and photons name {}: give --blocker-kind \
+                 treelet:128, or --split sorted",
+                map.prepared.kind
+            )));
+        }
+        Ok(Self { map, settings, fixed, middles, cells: None })
+    }
+
+    /// With the probabilities that are learned, if any, learned once for each cell of a grid over the map and light, from
+    /// 64 test rays that start at its photons, and not for each point.
+    pub fn by_cells(mut self) -> Self {
+        self.cells = (self.settings.rule != Rule::Uniform).then(|| Cells::of(&self.map));
+        self
     }
 
     /// The same settings, if they go with the blockers of a map.
@@ -61,7 +83,7 @@ impl<'a> MapTerms<'a> {
         }
         if settings.split == Split::Object {
             return Err(Error::Usage(
-                "--split object wants --blockers all; with --blockers map it is random or sorted, and \
+                "--split object wants --blockers all; with --blockers map it is random or sorted or treelet, and \
                  --blocker-kind object names objects"
                     .into(),
             ));
@@ -114,20 +136,21 @@ impl<C: Counter> Task for Ask<'_, C> {
         let map = &method.map;
         let prepared = map.prepared;
         let bvh = stage.bvh.on(simd);
-        let mut slots = vec![Neighbour::NONE; Nearest::room(prepared.k)];
+        let mut slots = photons::slots(prepared.k);
         let mut nearest = Nearest::new(prepared.k, &mut slots).expect("room for k");
         let mut room = vec![0; ROOM];
-        let mut tracers = [Tracer::new(), Tracer::new()];
+        let mut tracers = [Tracer::new(map.ways), Tracer::new(map.ways)];
         let mut blocked = [0u64; MOST / 64];
         let mut classes = [0; 4];
         let mut work = Work::new(method);
+        let mut learner = Work::new(method);
         for batch in &questions.batches {
             let point = &questions.points[batch.point as usize];
             let light = &stage.lights[batch.light as usize];
             let samples = batch.samples.start as usize..batch.samples.end as usize;
             let place = prepared.place(batch.light as usize, point.x, point.normal);
-            let photons = map.photons[batch.light as usize].on(simd);
-            let class = photons.classify(&place, &mut nearest, &mut room);
+            let near = map.photons[batch.light as usize].on(simd);
+            let class = near.classify(&place, &mut nearest, &mut room);
             let known = match class {
                 Class::Lit => {
                     let each = lit(light, point, &questions.weights[samples.clone()], batch.share);
@@ -142,10 +165,8 @@ impl<C: Counter> Task for Ask<'_, C> {
                 }
                 Class::Penumbra(blockers) => {
                     classes[2] += 1;
-                    work.divide(point, batch, blockers.list);
-                    tracers[0].aim_at(&prepared.blockers, stage, &work.names[..work.half]);
-                    tracers[1].aim_at(&prepared.blockers, stage, &work.names[work.half..]);
-                    work.begin(stage, point, batch);
+                    work.turn_to(point, batch.point);
+                    work.divide(point.x, blockers.list);
                     true
                 }
                 Class::Unknown => {
@@ -153,7 +174,92 @@ impl<C: Counter> Task for Ask<'_, C> {
                     false
                 }
             };
-            let x = point.origin.to_array();
+            let cell = match &method.cells {
+                Some(cells) if known => cells[batch.light as usize].find(point.x).map(|cell| (cells, cell)),
+                _ => None,
+            };
+            let mut of_cell = None;
+            if let Some((cells, cell)) = cell {
+                let cells = &cells[batch.light as usize];
+                of_cell = match cells.known(cell) {
+                    Some(known) => known,
+                    None => {
+                        let mut tally = Tally::default();
+                        let mut work_done = Counts::default();
+                        learner.random =
+                            Sampler::from_key(stage.seed ^ u64::from(cell) << 20 ^ u64::from(batch.light));
+                        learner.square.clear();
+                        learner.random.points(stage.pattern, TEST_RAYS, &mut learner.square);
+                        let starts = cells.starts(cell);
+                        for (i, &id) in starts.iter().enumerate() {
+                            let start = start_at(stage, prepared, light, id);
+                            let place = prepared.place(batch.light as usize, start.x, start.normal);
+                            let class = near.classify(&place, &mut nearest, &mut room);
+                            let Class::Penumbra(blockers) = class else { continue };
+                            learner.divide(start.x, blockers.list);
+                            learner.test_from(stage, &start, light, (i, starts.len()));
+                            let mut group = 0;
+                            while group < 2 {
+                                let part = learner.part(group);
+                                tracers[group].aim_at(&prepared.blockers, stage, &learner.names[part]);
+                                learner.gather(questions, batch, group);
+                                ask(
+                                    (simd, bvh),
+                                    (method, &mut learner, light),
+                                    (&start, group),
+                                    &mut tracers[group],
+                                    &mut blocked,
+                                    &mut work_done,
+                                );
+                                group += 1;
+                            }
+                            for visible in &learner.visible {
+                                tally.add(visible[0], visible[1]);
+                            }
+                        }
+                        let joint = tally.joint();
+                        let one = joint.and_then(|joint| learned(method.settings, &joint));
+                        // Counted once, whoever was quicker.
+                        if cells.learn(cell, one) {
+                            counter.rays(work_done.rays as u32);
+                            counter.triangle_tests(work_done.triangle_tests as u32);
+                            counter.node_tests(work_done.node_tests as u32);
+                        }
+                        one
+                    }
+                };
+            }
+            if known {
+                let (first, second) = (work.part(0), work.part(1));
+                tracers[0].aim_at(&prepared.blockers, stage, &work.names[first]);
+                tracers[1].aim_at(&prepared.blockers, stage, &work.names[second]);
+                work.begin(stage, point, batch, of_cell);
+                work.hidden.clear();
+                work.hidden.resize(samples.len().div_ceil(64), 0);
+                if let Some(boxes) = map.occluders.get(batch.light as usize) {
+                    let [x, y, z] = &questions.targets;
+                    let mut from = samples.start;
+                    while from < samples.end {
+                        let part = from..samples.end.min(from + MOST);
+                        if let Some(targets) =
+                            Targets::new(&x[part.clone()], &y[part.clone()], &z[part.clone()])
+                        {
+                            let targets = targets.on_parallelogram(light.corner, light.u, light.v);
+                            let first = (from - samples.start) / 64;
+                            let words = &mut work.hidden[first..first + part.len().div_ceil(64)];
+                            bvh.hidden_batch(
+                                boxes,
+                                point.origin,
+                                &targets,
+                                counter,
+                                &mut tracers[0].scratch,
+                                words,
+                            );
+                        }
+                        from = part.end;
+                    }
+                }
+            }
             if !known {
                 // The scene is asked, for every sample.
                 work.all(questions, batch);
@@ -178,34 +284,18 @@ impl<C: Counter> Task for Ask<'_, C> {
             }
             counter.rays(samples.len() as u32);
             loop {
-                // Several fields go by the number.
-                #[allow(clippy::needless_range_loop)]
-                for group in 0..2 {
+                let mut group = 0;
+                while group < 2 {
                     work.gather(questions, batch, group);
-                    let list = if group == 0 { &work.names[..work.half] } else { &work.names[work.half..] };
-                    if list.is_empty() {
-                        work.free(group);
-                        continue;
-                    }
-                    let mut from = 0;
-                    while from < work.places.len() {
-                        let part = from..work.places.len().min(from + MOST);
-                        from = part.end;
-                        let [tx, ty, tz] = &work.asked;
-                        let Some(targets) =
-                            Targets::new(&tx[part.clone()], &ty[part.clone()], &tz[part.clone()])
-                        else {
-                            continue;
-                        };
-                        let targets = targets.on_parallelogram(light.corner, light.u, light.v);
-                        let words = &mut blocked[..part.len().div_ceil(64)];
-                        let blockers = (&prepared.blockers, &map.objects[..]);
-                        let mut tests = Tests(&mut *counter);
-                        tracers[group].trace(blockers, (simd, bvh), list, x, &targets, &mut tests, words);
-                        for (i, &place) in work.places[part].iter().enumerate() {
-                            work.visible[place as usize][group] = blocked[i / 64] >> (i % 64) & 1 == 0;
-                        }
-                    }
+                    ask(
+                        (simd, bvh),
+                        (method, &mut work, light),
+                        (point, group),
+                        &mut tracers[group],
+                        &mut blocked,
+                        counter,
+                    );
+                    group += 1;
                 }
                 if work.finish(batch, estimates) {
                     break;
@@ -214,6 +304,53 @@ impl<C: Counter> Task for Ask<'_, C> {
         }
         classes
     }
+}
+
+/// Asks a half of the names about the samples gathered.
+#[inline(always)]
+fn ask<S: Simd>(
+    (simd, bvh): (S, Bvh<'_, S>),
+    (method, work, light): (&MapTerms<'_>, &mut Work<'_>, &AreaLight),
+    (point, group): (&ShadingPoint, usize),
+    tracer: &mut Tracer,
+    blocked: &mut [u64; MOST / 64],
+    counter: &mut impl Counter,
+) {
+    let part = work.part(group);
+    if part.is_empty() {
+        work.free(group);
+        return;
+    }
+    let x = point.origin.to_array();
+    let mut from = 0;
+    while from < work.places.len() {
+        let some = from..work.places.len().min(from + MOST);
+        from = some.end;
+        let [tx, ty, tz] = &work.asked;
+        let Some(targets) = Targets::new(&tx[some.clone()], &ty[some.clone()], &tz[some.clone()]) else {
+            continue;
+        };
+        let targets = targets.on_parallelogram(light.corner, light.u, light.v);
+        let words = &mut blocked[..some.len().div_ceil(64)];
+        let blockers = (&method.map.prepared.blockers, &method.map.objects[..]);
+        let mut tests = Tests(&mut *counter);
+        let names = &work.names[part.clone()];
+        tracer.trace(blockers, (simd, bvh), names, x, &targets, &mut tests, words);
+        for (i, &place) in work.places[some].iter().enumerate() {
+            work.visible[place as usize][group] = blocked[i / 64] >> (i % 64) & 1 == 0;
+        }
+    }
+}
+
+/// A photon as a point to trace test rays from, on the side that the middle of the light sees.
+fn start_at(stage: &Stage<'_>, prepared: &PreparedMap, light: &AreaLight, id: PhotonId) -> ShadingPoint {
+    let x = Vec3::from(prepared.store.position(id));
+    let path = light.point([0.5; 2]) - x;
+    let triangle = prepared.store.surface(id);
+    let normal = photons::normal(stage.scene, triangle).unwrap_or(Vec3::ZERO);
+    let normal = if normal.dot(path) < 0.0 { -normal } else { normal };
+    let origin = offset(x, normal, stage.bvh.clearance());
+    ShadingPoint { pixel: 0, path: 0, x, origin, normal, triangle, diffuse: Vec3::ZERO, key: 0 }
 }
 
 /// The batch at hand: first its test rays, if probabilities are learned, and then its samples.
@@ -231,6 +368,8 @@ struct Work<'a> {
     square: Vec<[f32; 2]>,
     choices: Vec<u32>,
     visible: Vec<[bool; 2]>,
+    /// Samples that boxes block, a bit each.
+    hidden: Vec<u64>,
     places: Vec<u32>,
     asked: [Vec<f32>; 3],
 }
@@ -250,22 +389,27 @@ impl<'a> Work<'a> {
             square: Vec::new(),
             choices: Vec::new(),
             visible: Vec::new(),
+            hidden: Vec::new(),
             places: Vec::new(),
             asked: Default::default(),
         }
     }
 
-    /// Puts the names in two halves.
-    fn divide(&mut self, point: &ShadingPoint, batch: &Batch, list: &[u32]) {
-        if self.point != Some(batch.point) {
-            self.point = Some(batch.point);
+    /// Takes the numbers of a point, if it is a new one.
+    fn turn_to(&mut self, point: &ShadingPoint, index: u32) {
+        if self.point != Some(index) {
+            self.point = Some(index);
             self.random = Sampler::from_key(point.key);
         }
+    }
+
+    /// Puts the names in two halves.
+    fn divide(&mut self, x: Vec3, list: &[u32]) {
         self.names.clear();
         self.names.extend_from_slice(list);
         self.half = list.len().div_ceil(2);
-        if self.method.settings.split == Split::Sorted {
-            let far = |name: u32| self.method.middles[name as usize].distance_squared(point.x);
+        if self.method.settings.split != Split::Random {
+            let far = |name: u32| self.method.middles[name as usize].distance_squared(x);
             self.order.clear();
             self.order.extend(list.iter().map(|&name| (far(name), name)));
             self.order.sort_unstable_by(|a, b| a.0.total_cmp(&b.0).then(a.1.cmp(&b.1)));
@@ -278,18 +422,36 @@ impl<'a> Work<'a> {
         }
     }
 
-    fn begin(&mut self, stage: &Stage<'_>, point: &ShadingPoint, batch: &Batch) {
-        self.one = self.method.fixed;
-        self.testing = self.method.settings.rule != Rule::Uniform;
+    /// Where the names of a half are.
+    fn part(&self, group: usize) -> std::ops::Range<usize> {
+        if group == 0 { 0..self.half } else { self.half..self.names.len() }
+    }
+
+    /// Turns to a batch: draws its terms, or first its test rays. With cells, `of_cell` is what that of the point knows.
+    fn begin(&mut self, stage: &Stage<'_>, point: &ShadingPoint, batch: &Batch, of_cell: Option<OneTerm>) {
+        self.one = of_cell.unwrap_or(self.method.fixed);
+        self.testing = self.method.settings.rule != Rule::Uniform && self.method.cells.is_none();
         if !self.testing {
             self.choose(batch);
             return;
         }
         let light = &stage.lights[batch.light as usize];
-        self.tests.iter_mut().for_each(Vec::clear);
         self.square.clear();
         self.random.points(stage.pattern, TEST_RAYS, &mut self.square);
-        for &at in &self.square {
+        self.test_from(stage, point, light, (0, 1));
+    }
+
+    /// Prepares the test rays of a point: of all that are drawn every `n`-th, from the `i`-th on.
+    fn test_from(
+        &mut self,
+        stage: &Stage<'_>,
+        point: &ShadingPoint,
+        light: &AreaLight,
+        (i, n): (usize, usize),
+    ) {
+        self.testing = true;
+        self.tests.iter_mut().for_each(Vec::clear);
+        for &at in self.square.iter().skip(i).step_by(n) {
             let y = light.point(at);
             let path = y - point.x;
             if light.normal.dot(path) < 0.0 && point.normal.dot(path) > 0.0 {
@@ -326,6 +488,9 @@ impl<'a> Work<'a> {
         } else {
             for (place, (&choice, visible)) in (0u32..).zip(self.choices.iter().zip(&self.visible)) {
                 let needs = self.one.needs(choice as usize);
+                if self.hidden(place as usize) {
+                    continue;
+                }
                 if if group == 0 { needs.a } else { needs.b.given(visible[0]) } {
                     self.places.push(place);
                 }
@@ -338,6 +503,11 @@ impl<'a> Work<'a> {
             asked.clear();
             asked.extend(self.places.iter().map(|&place| from[place as usize]));
         }
+    }
+
+    /// Do boxes block a sample?
+    fn hidden(&self, place: usize) -> bool {
+        self.hidden.get(place / 64).is_some_and(|word| word >> (place % 64) & 1 != 0)
     }
 
     /// All samples, for the scene to be asked.
@@ -369,8 +539,10 @@ impl<'a> Work<'a> {
             self.choose(batch);
             return false;
         }
-        let value = |(&choice, &[a, b]): (&u32, &[bool; 2])| self.one.value(choice as usize, a, b);
-        estimates.extend(self.choices.iter().zip(&self.visible).map(value));
+        let value = |(place, (&choice, &[a, b])): (usize, (&u32, &[bool; 2]))| {
+            if self.hidden(place) { 0.0 } else { self.one.value(choice as usize, a, b) }
+        };
+        estimates.extend(self.choices.iter().zip(&self.visible).enumerate().map(value));
         true
     }
 }

@@ -192,6 +192,13 @@ impl Stochastic {
     /// For a scene and its tree; an error if the settings do not go together, or not with the scene.
     pub fn new(settings: Settings, scene: &Scene, bvh: &Bvh<'_>) -> Result<Self> {
         let settings = settings.checked()?;
+        if settings.split == Split::Treelet {
+            return Err(Error::Usage(
+                "--split treelet wants --blockers map: it halves the subtrees that photons name; over all blockers \
+                 give --split sorted"
+                    .into(),
+            ));
+        }
         let units = Units::new(scene, bvh, settings.split, settings.groups)?;
         let fixed = if settings.groups > 2 {
             let mut reach = vec![0.0; settings.groups];

@@ -20,6 +20,9 @@ pub enum Split {
     Sorted,
     /// Whole objects of the file, the same for all points, in parts as equal as the objects allow.
     Object,
+    /// With --blockers map: subtrees of the scene's own tree, which photons name, by the distance of their middles. No
+    /// tree is built.
+    Treelet,
 }
 
 /// The most units that are drawn for a point.
@@ -168,7 +171,7 @@ impl Units {
                     groups.extend((first..last).map(|unit| ((unit - first + turn) % count) as u8));
                 }
             }
-            Split::Sorted => {
+            Split::Sorted | Split::Treelet => {
                 // Squares are not negative, so that their bits are in their order; then come the units.
                 order.clear();
                 order.extend(self.units.iter().zip(0u64..).map(|(unit, index)| {
