@@ -1,5 +1,6 @@
 //! Methods beside each other: the same camera samples, their errors, and the time they take.
 
+use crate::clock;
 use crate::film::{Film, Image};
 use crate::integrator::{
     Auto, AutoOptions, Exact, MapOptions, PreparedMap, Scratch, Settings, Stage, StageTimes, Stochastic,
@@ -79,16 +80,16 @@ impl<'a> Runner<'a> {
     }
 
     fn begin(&mut self, stage: &Stage<'_>) {
-        let start = Instant::now();
+        let start = clock::of_process();
         let tiles: Vec<_> = self.film.tiles().iter().map(|tile| tile.tile()).collect();
         self.visibility.begin(stage, &tiles, self.film.width());
-        let spent = start.elapsed().as_secs_f64();
+        let spent = (clock::of_process() - start).as_secs_f64();
         self.seconds += spent;
         self.prepared += spent;
     }
 
     fn pass(&mut self, stage: &Stage<'_>, pass: u32) {
-        let start = Instant::now();
+        let start = clock::of_process();
         let Self { visibility, film, scratches, .. } = self;
         let width = film.width();
         film.tiles_mut().par_iter_mut().for_each(|tile| {
@@ -97,7 +98,7 @@ impl<'a> Runner<'a> {
             render_tile(stage, &**visibility, width, pass, tile, &mut scratch);
         });
         visibility.passed(stage);
-        self.seconds += start.elapsed().as_secs_f64();
+        self.seconds += (clock::of_process() - start).as_secs_f64();
     }
 
     fn times(&self) -> StageTimes {
@@ -145,14 +146,14 @@ fn compare(
     let began = Instant::now();
     let size = comparison.size;
     let prepared = {
-        let start = Instant::now();
+        let start = clock::of_process();
         let wanted = comparison.methods.contains(&Method::Map);
-        wanted.then(|| (PreparedMap::new(stage, options), start.elapsed().as_secs_f64()))
+        wanted.then(|| (PreparedMap::new(stage, options), (clock::of_process() - start).as_secs_f64()))
     };
     let map = prepared.as_ref().map(|(prepared, seconds)| (prepared, *seconds));
     let mut runners = Vec::new();
     for &method in &comparison.methods {
-        let start = Instant::now();
+        let start = clock::of_process();
         let (visibility, before): (Box<dyn Visibility + '_>, f64) = match method {
             Method::Exact => (Box::new(Exact), 0.0),
             Method::Auto => (Box::new(Auto::new(AutoOptions::default())), 0.0),
@@ -164,7 +165,8 @@ fn compare(
                 (Box::new(map.visibility()), seconds)
             }
         };
-        runners.push(Runner::new(method, visibility, size, before + start.elapsed().as_secs_f64()));
+        let spent = (clock::of_process() - start).as_secs_f64();
+        runners.push(Runner::new(method, visibility, size, before + spent));
     }
     runners.iter_mut().for_each(|runner| runner.begin(stage));
 
@@ -265,8 +267,8 @@ fn compare(
     page.section("Gain");
     page.add(&table);
     page.prose(
-        "Visibility and light samples are summed over threads, the whole is on the clock, with what came before the first \
-         pass. The map is biased: more passes do not take its error away.",
+        "Times are those that threads worked, summed: whoever else uses the machine is not in them. The whole has all in it, \
+         with what came before the first pass. The map is biased: more passes do not take its error away.",
     );
     page.data(FILES[0], "one line a method");
 

@@ -13,6 +13,7 @@ pub use exact::{Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
+use crate::clock;
 use crate::film::{Tile, TileFilm};
 use crate::light::AreaLight;
 use crate::sampler::{Pattern, Sampler};
@@ -23,7 +24,7 @@ use occlude_kernel::occlusion_map::{Odds, bin};
 use occlude_kernel::{Bvh, Counter, Counts, RayPacket, Simd, Uncounted, offset};
 use std::f32::consts::FRAC_1_PI;
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Everything a render reads and nothing writes.
 #[derive(Clone, Copy)]
@@ -140,7 +141,7 @@ impl Questions {
     }
 }
 
-/// Where the time went, summed over threads.
+/// Where the time went, summed over threads: time they worked, where the system tells ([`crate::clock`]).
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StageTimes {
     /// Camera rays and their nearest hits.
@@ -225,19 +226,19 @@ fn render_paths(
     film: &mut TileFilm,
     scratch: &mut Scratch,
 ) {
-    let start = Instant::now();
+    let start = clock::of_thread();
     cast(stage, film.tile(), width, scratch);
-    let cast_end = Instant::now();
+    let cast_end = clock::of_thread();
     method.ask(stage, scratch);
-    let light_end = Instant::now();
+    let light_end = clock::of_thread();
     method.estimate(stage, &scratch.questions, &mut scratch.estimates, &mut scratch.shadow_counts);
-    let visibility_end = Instant::now();
+    let visibility_end = clock::of_thread();
     shade(stage, film, scratch);
     scratch.times += StageTimes {
         camera: cast_end - start,
         light: light_end - cast_end,
         visibility: visibility_end - light_end,
-        shade: visibility_end.elapsed(),
+        shade: clock::of_thread() - visibility_end,
     };
 }
 
