@@ -332,6 +332,11 @@ impl MapCell {
         self.state = LIT;
     }
 
+    /// Knows nothing any more but its bounds.
+    pub fn forget(&mut self) {
+        *self = Self { lower: self.lower, upper: self.upper, ..Self::new(self.key, self.normal) };
+    }
+
     /// Says that the map does not help here.
     pub fn set_all(&mut self) {
         self.state = ALL;

@@ -8,6 +8,11 @@
 //! than it would without a map, on average. Cells in which that does not help are rendered as by the exact method, and
 //! when all are such, so is the whole picture: then the map sleeps, and costs nothing any more.
 
+mod saved;
+
+pub use saved::{SavedMap, fingerprint};
+
+use self::saved::SavedCell;
 use super::{
     CameraSample, Fan, NOBODY, Open, Questions, Scratch, ShadingPoint, Stage, Visibility, cast, exact, expect, round,
     sample_lights,
@@ -19,7 +24,7 @@ use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::occlusion_map::{
-    BIN_EDGE, BINS, CLASSES, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally, bin,
+    BIN_EDGE, BINS, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally, bin,
 };
 use occlude_kernel::{Bvh, Counts, Hit, Ray, Simd, Targets, TileScratch, Uncounted, offset};
 use rayon::prelude::*;
@@ -57,6 +62,10 @@ pub struct Auto {
     strays: Mutex<Vec<Stray>>,
     /// How far this pass' guesses are off.
     doubts: Mutex<Doubts>,
+    /// What was learned before.
+    before: Option<SavedMap>,
+    /// Whether it goes on learning where it is no help.
+    restless: bool,
 }
 
 /// What the map knew after a pass, by the points that ask it.
@@ -201,6 +210,26 @@ impl Map {
         self.tallies[place].fetch_add(1 << 32 | u64::from(free), Ordering::Relaxed);
     }
 
+    /// Takes in what was learned before, as far as there is room.
+    fn remember(&mut self, saved: &SavedMap, options: &AutoOptions) {
+        let room = options.memory / CELL_BYTES;
+        self.full = saved.cells.len() > room;
+        for SavedCell { cell, points, tallies } in saved.cells.iter().take(room) {
+            self.cells.push(*cell);
+            self.points.push(*points);
+            self.tries.push(TRIES);
+            let words = tallies.iter().map(|tally| u64::from(tally.asked) << 32 | u64::from(tally.free));
+            self.tallies.extend(words.map(AtomicU64::new));
+        }
+        for cell in &mut self.cells {
+            cell.forget();
+        }
+        self.passes = saved.passes;
+        self.doubts = saved.doubts;
+        self.table.resize(OcclusionMap::table(self.cells.len()), OcclusionMap::FREE);
+        OcclusionMap::index(&self.cells, &mut self.table);
+    }
+
     /// Makes room for points that have none.
     fn take_in(&mut self, mut strays: Vec<Stray>, stage: &Stage<'_>, options: &AutoOptions) {
         strays.par_sort_unstable_by_key(Stray::order);
@@ -254,7 +283,7 @@ impl Map {
                     return;
                 }
                 *tries -= 1;
-                let light = &stage.lights[cell.key().light() as usize];
+                let Some(light) = stage.lights.get(cell.key().light() as usize) else { return };
                 let corners = cell.corners();
                 let lit = dispatch(stage.level, Prove { bvh: stage.bvh, light, corners: &corners, scratch });
                 if lit {
@@ -542,6 +571,76 @@ impl Auto {
         Self { options, ..Self::default() }
     }
 
+    /// With what was learned before. Whatever that is, even of another scene, pictures stay right on average; but it only
+    /// helps with the same triangles and lights, and a camera near the same place: [`SavedMap::check`].
+    pub fn with_saved(options: AutoOptions, saved: SavedMap) -> Self {
+        Self { options, before: Some(saved), ..Self::default() }
+    }
+
+    /// One that never falls asleep, to learn for others.
+    pub fn restless(self) -> Self {
+        Self { restless: true, ..self }
+    }
+
+    /// What has been learned so far.
+    pub fn save(&self, stage: &Stage<'_>) -> SavedMap {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let cells = map.cells.iter().zip(&map.points).enumerate();
+        SavedMap {
+            belongs_to: fingerprint(stage),
+            passes: map.passes,
+            shadow_rays: stage.shadow_rays,
+            doubts: map.doubts,
+            cells: cells
+                .map(|(index, (&cell, &points))| SavedCell { cell, points, tallies: map.tally(index) })
+                .collect(),
+        }
+    }
+
+    /// What the map knew after each lesson.
+    pub fn history(&self) -> Vec<Learned> {
+        self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner()).history.clone()
+    }
+
+    /// Bytes that the map takes.
+    pub fn bytes(&self) -> usize {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        map.cells.len() * CELL_BYTES + map.table.len() * size_of::<u32>()
+    }
+
+    /// What is known of the light that the first camera sample of each pixel of a tile might get: the part that is
+    /// proven lit, the part of the usual samples that is asked for, and how much of it the exact method is left with.
+    pub fn survey(&self, stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) -> Vec<[f32; 3]> {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let view = map.view();
+        scratch.paths.clear();
+        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: 0 }));
+        cast(&Stage { count: false, ..*stage }, tile, width, scratch);
+        let mut seen = vec![[f32::NAN; 3]; tile.len()];
+        for point in &scratch.questions.points {
+            let (mut sums, mut total) = ([0.0; 3], 0.0f32);
+            for (light, area) in (0..).zip(stage.lights) {
+                let Some(unshadowed) = area.unshadowed(point.x, point.normal) else { continue };
+                let key = map.key(&self.options, stage.eye, point.x, point.normal, light);
+                let cell = key.and_then(|key| view.find(key)).map(|cell| &view.cells()[cell]);
+                let value = unshadowed * area.radiance.element_sum();
+                total += value;
+                let [lit, part, left] = match cell.map(|cell| (cell, cell.known(point.origin))) {
+                    Some((_, Known::Lit)) => [1.0, 0.0, 0.0],
+                    Some((cell, Known::Odds)) if !map.asleep => [0.0, cell.part(), 0.0],
+                    _ => [0.0, 1.0, 1.0],
+                };
+                for (sum, add) in sums.iter_mut().zip([lit, part, left]) {
+                    *sum += value * add;
+                }
+            }
+            if total > 0.0 {
+                seen[point.pixel as usize] = sums.map(|sum| sum / total);
+            }
+        }
+        seen
+    }
+
     /// Lets somebody change what the map thinks, between passes. Whatever it thinks, pictures stay right on average, as
     /// long as no cell is called lit that is not.
     pub fn alter(&self, change: impl FnOnce(&mut [MapCell])) {
@@ -633,6 +732,9 @@ impl Visibility for Auto {
         let beside = stage.camera.ray_direction(0.5 * width as f32 + 1.0, 0.5 * width as f32);
         let most_strays = self.options.memory / size_of::<Stray>() / tiles.len().max(1);
         *map = Map { angle: (beside - ahead).length() / ahead.length(), most_strays, ..Map::default() };
+        if let Some(before) = &self.before {
+            map.remember(before, &self.options);
+        }
         let found = &*map;
         // A look at every other pixel of every other row finds nearly all cells there are.
         let looks: Vec<(Vec<Stray>, usize)> = tiles
@@ -837,6 +939,7 @@ impl Visibility for Auto {
         map.prove(stage);
         if worth_learning(map.passes) {
             map.learn();
+            map.asleep &= !self.restless;
         }
     }
 }

@@ -8,7 +8,7 @@ mod exact;
 mod map;
 mod stochastic;
 
-pub use auto::{Auto, AutoOptions};
+pub use auto::{Auto, AutoOptions, Learned, SavedMap, fingerprint};
 pub use exact::{Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
