@@ -371,7 +371,8 @@ fn maps_are_saved_looked_into_used_and_refused() {
     let (columns, plates) = (scene("columns"), scene("plates"));
     let size = ["--size", "48x27", "-q"];
     for (name, threads) in [("a.map", "1"), ("b.map", "3")] {
-        let options = ["map", &columns, "-o", name, "--passes", "3", "--shadow-rays", "32", "--threads", threads];
+        let options =
+            ["map", &columns, "-o", name, "--passes", "3", "--shadow-rays", "32", "--threads", threads];
         done(&[&options[..], &size].concat());
     }
     let read = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
@@ -421,10 +422,30 @@ fn maps_are_saved_looked_into_used_and_refused() {
 
     refused(&["map", &columns], "is a scene: say where to write its map, with -o FILE");
     refused(&["map", &columns, "-o", "no/such/folder.map"], "no/such");
-    refused(&["render", &columns, "--method", "exact", "--map", "a.map"], "--map is an option of --method auto");
+    refused(
+        &["render", &columns, "--method", "exact", "--map", "a.map"],
+        "--map is an option of --method auto",
+    );
     refused(&["render", &columns, "--method", "map", "--map-memory", "1M"], "--map-memory is an option of");
     refused(&["render", &columns, "--method", "auto", "--map-memory", "lots"], "wants a number of bytes");
-    done(&[&["render", &columns, "--method", "auto", "--map-memory", "100k", "-o", "small.png", "--spp", "1"][..], &size].concat());
+    done(
+        &[
+            &[
+                "render",
+                &columns,
+                "--method",
+                "auto",
+                "--map-memory",
+                "100k",
+                "-o",
+                "small.png",
+                "--spp",
+                "1",
+            ][..],
+            &size,
+        ]
+        .concat(),
+    );
 }
 
 #[test]

@@ -373,6 +373,7 @@ fn pictures_are_right_on_average_whatever_the_map_holds() {
             assert_unbiased(&setting, &format!("{scene}, {what}"), method, &reference);
         };
         check("auto", &Auto::new(AutoOptions::default()));
+        check("auto that never sleeps", &Auto::new(AutoOptions::default()).restless());
         let small = AutoOptions { memory: 1 << 17, ..AutoOptions::default() };
         check("a map with room for few cells", &Auto::new(small));
         let empty = AutoOptions { memory: 0, ..AutoOptions::default() };
@@ -405,11 +406,11 @@ fn pictures_are_right_on_average_whatever_the_map_holds() {
             let refused = foreign.check("a.map", stage).expect_err("another scene");
             assert!(refused.to_string().contains("belongs to other triangles"), "{refused}");
         });
-        check("a map of another scene", &Auto::with_saved(AutoOptions::default(), foreign));
+        check("a map of another scene", &Auto::with_saved(AutoOptions::default(), foreign).restless());
         let auto = Auto::new(AutoOptions::default());
         setting.passes(&auto, 4, 16);
         let own = setting.with_stage(16, detect(), |stage| auto.save(stage));
-        check("a map that has learned before", &Auto::with_saved(AutoOptions::default(), own));
+        check("a map that has learned before", &Auto::with_saved(AutoOptions::default(), own).restless());
     }
 }
 

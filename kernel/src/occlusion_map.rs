@@ -497,7 +497,8 @@ impl MapCell {
             self.rows[column] = share(&rows, 1);
             let mut above = 0;
             for row in 0..BIN_EDGE {
-                let parts = f32::from(self.columns[column] - from) * f32::from(self.rows[column][row] - above);
+                let parts =
+                    f32::from(self.columns[column] - from) * f32::from(self.rows[column][row] - above);
                 let density = parts * (BINS as f32 / (PARTS * PARTS) as f32);
                 densities[row * BIN_EDGE + column] = density;
                 least = density.min(least);
@@ -720,8 +721,11 @@ impl Doubts {
         for of in &mut rates.of {
             for (rate, variance) in of.iter_mut().zip(rates.variance) {
                 let ratio = variance / price;
-                let wanted =
-                    if ratio < 1.0 { libm::sqrtf(ratio) } else { libm::powf(1.5 * spread * ratio, 0.4).max(1.0) };
+                let wanted = if ratio < 1.0 {
+                    libm::sqrtf(ratio)
+                } else {
+                    libm::powf(1.5 * spread * ratio, 0.4).max(1.0)
+                };
                 *rate = wanted.clamp(LEAST_RATE, MOST_RATE);
             }
             price *= 0.625;

@@ -14,8 +14,8 @@ pub use saved::{SavedMap, fingerprint};
 
 use self::saved::SavedCell;
 use super::{
-    CameraSample, Fan, NOBODY, Open, Questions, Scratch, ShadingPoint, Stage, Visibility, cast, exact, expect, round,
-    sample_lights,
+    CameraSample, Fan, NOBODY, Open, Questions, Scratch, ShadingPoint, Stage, Visibility, cast, exact,
+    expect, round, sample_lights,
 };
 use crate::film::Tile;
 use crate::light::{AreaLight, Shape};
@@ -173,8 +173,11 @@ impl Default for Map {
 const TRIES: u8 = 4;
 
 /// What it costs to look a point up, and to think of a light there, ns; and of each sample.
-const CONSIDERED: f64 = 150.0;
+const CONSIDERED: f64 = 250.0;
 const SAMPLED: f64 = 5.0;
+
+/// What it costs more to draw a sample from a cell's density, and to take what is known from it.
+const DRAWN: f64 = 3.0;
 
 /// What well spread samples leave of the variance that bins have by themselves, times the root of their number: a border
 /// crosses few of a point's bins, but many of a cell's.
@@ -349,7 +352,7 @@ impl Map {
             exact_error += points * usual;
             if cell.is_known() {
                 decided += points;
-                let known_time = CONSIDERED + exact_time * f64::from(cell.part());
+                let known_time = CONSIDERED + (exact_time + samples * DRAWN) * f64::from(cell.part());
                 let hopeless = known_time * left > HOPELESS * exact_time * usual;
                 if !(self.passes >= FOR_GOOD && hopeless && cell.part() > 0.8) {
                     time += points * known_time;
@@ -365,7 +368,8 @@ impl Map {
             error += points * usual;
         }
         self.promise = all * exact_time * exact_error / (time * error).max(f64::MIN_POSITIVE);
-        if self.passes >= FOR_GOOD && self.promise < AWAKE && (decided > 0.5 * all || self.passes >= PATIENCE) {
+        if self.passes >= FOR_GOOD && self.promise < AWAKE && (decided > 0.5 * all || self.passes >= PATIENCE)
+        {
             self.asleep = true;
         }
         self.history.push(Learned {
@@ -404,6 +408,13 @@ impl Map {
 
 /// Rays to see what rays cost.
 const PROBES: usize = 4096;
+
+/// Is it counted what a point's rays see? Always at first, and later of every second and of every fourth one: where rays
+/// are cheap, counting costs as much as they do.
+fn heard(point: u32, passes: u32) -> bool {
+    let every = [1, 1, 1, 2, 2, 2, 2, 2].get(passes as usize).copied().unwrap_or(4);
+    point.wrapping_add(passes).is_multiple_of(every)
+}
 
 /// Passes before guesses are put to use: in the first there are none, and the second shows how far they are off.
 const TRIAL: u32 = 2;
@@ -773,6 +784,7 @@ impl Visibility for Auto {
         map.prove(stage);
         map.probe(&strays, stage);
         map.learn();
+        map.asleep &= !self.restless;
     }
 
     fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
@@ -801,8 +813,7 @@ impl Visibility for Auto {
             for share in shares.iter_mut() {
                 let light = share.light;
                 let key = || place.and_then(|key| key.with_light(light));
-                let cell =
-                    *found[light as usize].get_or_insert_with(|| key().and_then(|key| view.find(key)));
+                let cell = *found[light as usize].get_or_insert_with(|| key().and_then(|key| view.find(key)));
                 let thought = match cell.map(|cell| view.cells()[cell].known(point.origin)) {
                     Some(Known::Odds) if map.passes < TRIAL => Known::Nothing,
                     Some(thought) => thought,
@@ -816,11 +827,7 @@ impl Visibility for Auto {
                 }
                 let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
                 if outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays {
-                    strays.extend(key().map(|key| Stray {
-                        key,
-                        origin: point.origin,
-                        normal: point.normal,
-                    }));
+                    strays.extend(key().map(|key| Stray { key, origin: point.origin, normal: point.normal }));
                 }
                 if let (Known::Odds, Some(cell)) = (thought, cell) {
                     share.expected *= view.cells()[cell].part();
@@ -836,8 +843,8 @@ impl Visibility for Auto {
                     radiance[point.path as usize] += full * whole;
                     continue;
                 }
-                let cell = cell.filter(|_| thought != Known::All);
                 let odds = cell.filter(|_| thought == Known::Odds).map(|cell| &view.cells()[cell]);
+                let cell = cell.filter(|_| thought != Known::All && heard(index as u32, map.passes));
                 if share.count == 0 {
                     if let Some(cell) = odds {
                         radiance[point.path as usize] += full * (cell.mean() * whole);

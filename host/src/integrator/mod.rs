@@ -78,6 +78,30 @@ pub trait Visibility: Sync {
     );
 }
 
+impl<V: Visibility + ?Sized> Visibility for &V {
+    fn begin(&self, stage: &Stage<'_>, tiles: &[Tile], width: u32) {
+        (**self).begin(stage, tiles, width);
+    }
+
+    fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
+        (**self).ask(stage, scratch);
+    }
+
+    fn passed(&self, stage: &Stage<'_>) {
+        (**self).passed(stage);
+    }
+
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        (**self).estimate(stage, questions, estimates, counts);
+    }
+}
+
 /// A point that light may reach.
 #[derive(Clone, Copy, Debug)]
 pub struct ShadingPoint {

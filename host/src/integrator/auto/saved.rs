@@ -57,7 +57,10 @@ pub fn fingerprint(stage: &Stage<'_>) -> u64 {
     let mut hash = Hash::default();
     let scene = stage.scene;
     for k in 0..scene.triangles.len() as u32 {
-        scene.vertices(k).iter().for_each(|vertex| vertex.to_array().iter().for_each(|at| hash.add(at.to_bits())));
+        scene
+            .vertices(k)
+            .iter()
+            .for_each(|vertex| vertex.to_array().iter().for_each(|at| hash.add(at.to_bits())));
     }
     for light in stage.lights {
         let shape = if light.shape == Shape::Triangle { 3 } else { 4 };
@@ -176,7 +179,9 @@ impl SavedMap {
         }
         let version = rest.u32();
         if version != VERSION {
-            return Err(damaged(&format!("is of version {version}, and this program reads version {VERSION}")));
+            return Err(damaged(&format!(
+                "is of version {version}, and this program reads version {VERSION}"
+            )));
         }
         let (belongs_to, count) = (rest.u64(), rest.u64());
         let expected = (count as u128) * EACH as u128 + (HEAD + 8) as u128;
@@ -200,8 +205,7 @@ impl SavedMap {
             let key = CellKey::from_bits(rest.u64());
             let bounds = [rest.three(), rest.three(), rest.three()];
             let points = rest.u32();
-            let tallies =
-                std::array::from_fn(|_| Tally { asked: rest.u32(), free: rest.u32() });
+            let tallies = std::array::from_fn(|_| Tally { asked: rest.u32(), free: rest.u32() });
             let cell = MapCell::restore(key, bounds).ok_or_else(|| damaged("is damaged"))?;
             if tallies.iter().any(|tally: &Tally| tally.free > tally.asked) {
                 return Err(damaged("is damaged"));
@@ -302,7 +306,8 @@ mod tests {
                 let key = CellKey::new(x, [0.0, 0.0, 1.0], 0, k % 2).expect("near");
                 let mut cell = MapCell::new(key, [0.0, 0.0, 1.0]);
                 cell.add(x);
-                let tallies = std::array::from_fn(|bin| Tally { asked: bin as u32 + k, free: bin as u32 / 2 });
+                let tallies =
+                    std::array::from_fn(|bin| Tally { asked: bin as u32 + k, free: bin as u32 / 2 });
                 SavedCell { cell, points: k, tallies }
             })
             .collect();
