@@ -916,8 +916,9 @@ impl Visibility for Auto {
         for (batch, &index) in questions.batches.iter().zip(&questions.cells) {
             let Some(cell) = map.cells.get(index as usize) else { continue };
             let first = index as usize * BINS;
-            for i in batch.samples.start as usize..batch.samples.end as usize {
-                let (bin, free) = (usize::from(questions.bins[i]) % BINS, estimates[i] > 0.0);
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            for (&bin, &estimate) in questions.bins[samples.clone()].iter().zip(&estimates[samples]) {
+                let (bin, free) = (usize::from(bin) % BINS, estimate > 0.0);
                 map.count(first + bin, free);
                 if cell.is_known() {
                     doubts.count(cell.odds(bin), free);
