@@ -391,6 +391,101 @@ fn the_map_that_learns_renders_and_is_compared() {
 }
 
 #[test]
+fn maps_are_saved_looked_into_used_and_refused() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let run = |args: &[&str]| occlude(args, folder.path());
+    let done = |args: &[&str]| {
+        let done = run(args);
+        assert_eq!(done.status.code(), Some(0), "{args:?}: {}", text(&done.stderr));
+        text(&done.stdout)
+    };
+    let refused = |args: &[&str], why: &str| {
+        let refused = run(args);
+        let message = text(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(2), "{args:?}: {message}");
+        assert!(message.contains(why), "{args:?}: {message}");
+    };
+    let (columns, plates) = (scene("columns"), scene("plates"));
+    let size = ["--size", "48x27", "-q"];
+    for (name, threads) in [("a.map", "1"), ("b.map", "3")] {
+        let options =
+            ["map", &columns, "-o", name, "--passes", "3", "--shadow-rays", "32", "--threads", threads];
+        done(&[&options[..], &size].concat());
+    }
+    let read = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
+    assert!(read("a.map") == read("b.map"), "the same for any number of threads");
+    for args in [&["map", "a.map"][..], &["map", "--inspect", "a.map"]] {
+        let said = done(args);
+        assert!(said.contains("learned from   3 passes of 32 shadow rays"), "{said}");
+    }
+    let render = |scene: &str, map: &str| {
+        let args = ["render", scene, "--method", "auto", "--map", map, "-o", "picture.exr", "--spp", "2"];
+        [&args[..], &size].concat().into_iter().map(str::to_owned).collect::<Vec<_>>()
+    };
+    let with = |owned: Vec<String>, then: &dyn Fn(&[&str])| {
+        then(&owned.iter().map(String::as_str).collect::<Vec<_>>());
+    };
+    with(render(&columns, "a.map"), &|args| {
+        done(args);
+    });
+    let picture = read("picture.exr");
+    // Nothing is overwritten when a map is refused.
+    let write = |name: &str, bytes: &[u8]| std::fs::write(folder.path().join(name), bytes).expect(name);
+    let bytes = read("a.map");
+    write("short.map", &bytes[..bytes.len() / 2]);
+    let mut damaged = bytes.clone();
+    damaged[bytes.len() / 2] ^= 1;
+    write("damaged.map", &damaged);
+    let mut version = bytes.clone();
+    version[12] = 200;
+    write("version.map", &version);
+    let mut turned = bytes.clone();
+    turned[8..12].reverse();
+    write("turned.map", &turned);
+    write("other.map", b"P6 1 1 255 abc");
+    for (map, why) in [
+        ("short.map", "ends early"),
+        ("damaged.map", "is damaged"),
+        ("version.map", "is of version 200"),
+        ("turned.map", "other order"),
+        ("other.map", "is not a map"),
+        ("absent.map", "reading absent.map"),
+    ] {
+        with(render(&columns, map), &|args| refused(args, why));
+        refused(&["map", map], why);
+    }
+    with(render(&plates, "a.map"), &|args| refused(args, "belongs to other triangles or lights"));
+    assert!(read("picture.exr") == picture);
+
+    refused(&["map", &columns], "is a scene: say where to write its map, with -o FILE");
+    refused(&["map", &columns, "-o", "no/such/folder.map"], "no/such");
+    refused(
+        &["render", &columns, "--method", "exact", "--map", "a.map"],
+        "--map is an option of --method auto",
+    );
+    refused(&["render", &columns, "--method", "map", "--map-memory", "1M"], "--map-memory is an option of");
+    refused(&["render", &columns, "--method", "auto", "--map-memory", "lots"], "wants a number of bytes");
+    done(
+        &[
+            &[
+                "render",
+                &columns,
+                "--method",
+                "auto",
+                "--map-memory",
+                "100k",
+                "-o",
+                "small.png",
+                "--spp",
+                "1",
+            ][..],
+            &size,
+        ]
+        .concat(),
+    );
+}
+
+#[test]
 fn the_theory_is_reproduced() {
     let folder = tempfile::tempdir().expect("a folder");
     let run = |threads: &str, into: &str| {

@@ -10,7 +10,7 @@ use occlude_host::sampler::Pattern;
 use occlude_host::scene::{Camera, CameraRequest, Scene, load};
 use occlude_kernel::lanes::{Level, detect, levels};
 use occlude_kernel::occlusion_map::{
-    BINS, CLASSES, CellKey, Chances, Coin, Doubts, Known, LEAST_CHANCE, MapCell, OcclusionMap, Odds, Tally,
+    BINS, CLASSES, CellKey, Demand, Doubts, Known, LEAST_CHANCE, MapCell, OcclusionMap, Odds, Rates, Tally,
     bin, class,
 };
 use occlude_kernel::{Ray, Targets, TileScratch, Uncounted};
@@ -18,40 +18,62 @@ use occlude_tests::Random;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
 
+/// Rates of classes whose doubts are measured to be what they like.
+fn rates(random: &mut Random) -> Rates {
+    let mut doubts = Doubts::default();
+    for class in 0..CLASSES {
+        doubts.asked[class] = 1 << 30;
+        doubts.squared[class] = (random.unit().powi(4) * 65025.0 * 2f32.powi(28)) as u64;
+    }
+    let mut rates = doubts.rates(0.06);
+    let mut demand = Demand::default();
+    for _ in 0..20 {
+        let expected = std::array::from_fn(|_| random.unit().powi(6));
+        demand.add(&expected, f64::from(random.unit()), &rates);
+    }
+    rates.choose(&demand, 0.3, 0.1);
+    rates
+}
+
 #[test]
-fn over_all_starts_every_segment_is_asked_with_its_chance_and_corrected_to_its_visibility() {
+fn over_all_places_samples_are_corrected_to_the_mean_visibility() {
     let mut random = Random::new(1);
-    for _ in 0..200 {
-        let odds: Vec<Odds> = (0..40)
-            .map(|_| Odds { u: (random.unit() * 256.0) as u8, class: (random.unit() * 16.0) as u8 })
-            .collect();
-        let chances = {
-            let mut doubts = Doubts::default();
-            for class in 0..CLASSES {
-                doubts.asked[class] = 1 << 30;
-                doubts.squared[class] = (random.unit().powi(4) * 65025.0 * 2f32.powi(28)) as u64;
-            }
-            doubts.chances(&[1000; CLASSES], 0, 0.1, 0.06)
-        };
-        let mut asked = [0u32; 40];
-        let mut sums = [[0.0f64; 2]; 40];
-        for start in 0..LEAST_CHANCE {
-            let mut coin = Coin::new((start as f32 + random.unit()) / LEAST_CHANCE as f32);
-            for (i, odds) in odds.iter().enumerate() {
-                let toss = coin.toss(chances.of(odds.class));
-                asked[i] += u32::from(toss);
-                for free in [false, true] {
-                    let correction = if toss { odds.correction(&chances, free) } else { 0.0 };
-                    sums[i][usize::from(free)] += f64::from(odds.guess(&chances)) + f64::from(correction);
-                }
-            }
+    let key = CellKey::new([0.0; 3], [0.0, 0.0, 1.0], 0, 0).expect("near");
+    for round in 0..100 {
+        let rates = if round % 4 == 0 { Rates::each(random.unit()) } else { rates(&mut random) };
+        let power = 1 << (round % 5);
+        let expected: [f32; BINS] = std::array::from_fn(|_| {
+            let p = random.unit().powi(power);
+            if random.unit() < 0.5 { p } else { 1.0 - p }
+        });
+        let mut cell = MapCell::new(key, [0.0, 0.0, 1.0]);
+        cell.learn(Some(&expected), &rates);
+        assert_eq!(cell.known([0.0; 3]), Known::Odds);
+        let part = f64::from(cell.part());
+        assert!(part > 0.0 && part <= 1.0, "{part}");
+        // Any visibility of each bin, a sample in the middle of each of 64 by 64 parts, and the sum in closed form.
+        let free: [f64; BINS] = std::array::from_fn(|_| f64::from(random.unit()).round());
+        let guess = |bin: usize| f64::from(cell.odds(bin).guess());
+        let mean_guess = (0..BINS).map(guess).sum::<f64>() / BINS as f64;
+        assert!((mean_guess - f64::from(cell.mean())).abs() < 1e-5);
+        let (mut sum, mut area) = (mean_guess, [0.0; BINS]);
+        for k in 0..64 * 64 {
+            let at = |k: usize| (k as f32 + 0.5) / 64.0;
+            let drawn = cell.draw([at(k % 64), at(k / 64)]);
+            let bin_of = usize::from(drawn.bin);
+            assert_eq!(bin(drawn.at), bin_of, "{drawn:?}");
+            let density = f64::from(drawn.density);
+            assert!(density * part >= 0.999 / f64::from(LEAST_CHANCE), "{density} of {part}");
+            sum += (free[bin_of] - guess(bin_of)) / density / 4096.0;
+            area[bin_of] += 1.0 / density / 4096.0;
         }
-        for (i, odds) in odds.iter().enumerate() {
-            assert_eq!(asked[i], u32::from(chances.of(odds.class)));
-            for free in [0, 1] {
-                let mean = sums[i][free] / f64::from(LEAST_CHANCE);
-                assert!((mean - free as f64).abs() < 1e-5, "{odds:?}: {mean} for {free}");
-            }
+        let mean = free.iter().sum::<f64>() / BINS as f64;
+        assert!((sum - mean).abs() < 1e-6, "round {round}: {sum} for {mean}");
+        assert!(area.iter().all(|area| (area - 1.0 / BINS as f64).abs() < 1e-9), "round {round}: {area:?}");
+        // Ends of the square, and numbers as near to them as there are.
+        for at in [0.0, f32::MIN_POSITIVE, 1.0 - f32::EPSILON / 2.0] {
+            let drawn = cell.draw([at, 1.0 - f32::EPSILON / 2.0 - at]);
+            assert!(drawn.at.iter().all(|at| (0.0..=1.0).contains(at)) && drawn.density > 0.0, "{drawn:?}");
         }
     }
 }
@@ -142,10 +164,10 @@ fn bins_cut_the_square_evenly() {
 fn cells_learn_what_they_saw() {
     let key = CellKey::new([0.0; 3], [0.0, 0.0, 1.0], 0, 0).expect("near");
     let mut cell = MapCell::new(key, [0.0, 0.0, 1.0]);
-    let chances = Chances::each(4);
+    let rates = Rates::each(0.25);
     let mut tallies = [Tally::default(); BINS];
     assert_eq!(MapCell::expect(&tallies), None, "nothing seen");
-    cell.learn(None, &chances, 1.0);
+    cell.learn(None, &rates);
     assert_eq!(cell.known([0.0; 3]), Known::Nothing);
     // Free to the left, dark to the right.
     for (k, tally) in tallies.iter_mut().enumerate() {
@@ -158,55 +180,60 @@ fn cells_learn_what_they_saw() {
         assert!(if column < 4 { p > 0.99 } else { p < 0.01 }, "column {column}: {p}");
     }
     assert!(class(expected[0]) > class(expected[3]), "near the border there is more doubt");
-    cell.learn(Some(&expected), &chances, 1.0);
-    assert_eq!(cell.known([0.0; 3]), Known::Bins);
-    assert!(cell.odds(0).guess(&chances) > 0.99 && cell.odds(7).guess(&chances) == 0.0);
-    assert_eq!(cell.odds(0).guess(&Chances::ALL), 0.0, "nothing is left to guess");
-    cell.learn(Some(&expected), &chances, 0.2);
-    assert_eq!(cell.known([0.0; 3]), Known::All, "a quarter is more than a fifth");
-    cell.learn(Some(&[0.0; BINS]), &chances, 1.0);
-    assert_eq!(cell.known([0.0; 3]), Known::Flat(Odds { u: 0, class: CLASSES as u8 - 1 }));
+    cell.learn(Some(&expected), &rates);
+    assert_eq!(cell.known([0.0; 3]), Known::Odds);
+    assert!(!cell.is_flat());
+    assert!(cell.odds(0).guess() > 0.99 && cell.odds(7).guess() == 0.0);
+    cell.set_all();
+    assert_eq!(cell.known([0.0; 3]), Known::All);
+    cell.learn(Some(&[0.0; BINS]), &rates);
+    assert_eq!(cell.known([0.0; 3]), Known::Odds);
+    assert!(cell.is_flat() && cell.mean() == 0.0);
+    assert_eq!(cell.odds(9), Odds { u: 0, class: CLASSES as u8 - 1 });
+    assert!((cell.part() - 0.25).abs() < 1e-6 && cell.draw([0.3, 0.7]).density == 1.0);
     // What is proven is not unlearned, and holds within the bounds only.
     cell.add([0.25, 0.25, 0.0]);
     cell.set_lit();
-    cell.learn(Some(&[0.5; BINS]), &chances, 1.0);
+    cell.learn(Some(&[0.5; BINS]), &rates);
     assert_eq!(cell.known([0.25, 0.25, 0.0]), Known::Lit);
-    assert!(matches!(cell.known([0.25, 0.5, 0.0]), Known::Flat(odds) if odds.guess(&chances) == 1.0));
+    assert_eq!(cell.known([0.25, 0.5, 0.0]), Known::Odds);
+    assert_eq!(cell.odds(0).guess(), 1.0);
+    // What is kept of it is the bounds.
+    let again = MapCell::restore(cell.key(), cell.bounds()).expect("as it was");
+    assert_eq!((again.corners(), again.is_known()), (cell.corners(), false));
+    assert!(MapCell::restore(cell.key(), [[0.0; 3], [0.0; 3], [1.0; 3]]).is_none(), "no normal");
+    assert!(MapCell::restore(cell.key(), [[0.0, 0.0, 1.0], [f32::NAN; 3], [1.0; 3]]).is_none());
     cell.add([0.25, 0.5, 0.0]);
     assert!(!cell.is_lit(), "it grew");
 }
 
 #[test]
-fn chances_follow_what_was_measured() {
+fn rates_follow_what_was_measured() {
     let mut doubts = Doubts::default();
-    assert_eq!(doubts.chances(&[100; CLASSES], 0, 0.1, 0.06), Chances::ALL, "nobody knows");
     for k in 0..CLASSES {
         doubts.asked[k] = 1 << 20;
         doubts.squared[k] = ((65025u64 << 20) / 5) >> k;
     }
-    // Few segments of much doubt, many of little.
-    let segments: [u64; CLASSES] = std::array::from_fn(|k| 100 << (k / 2));
-    let chances = doubts.chances(&segments, 0, 0.05, 0.06);
-    let q: Vec<u8> = (0..CLASSES as u8).map(|class| chances.of(class)).collect();
-    assert!(q.is_sorted_by(|a, b| a >= b), "{q:?}");
-    assert!(q[0] == 16 && q[CLASSES - 1] < 4, "{q:?}");
-    // The product of work and error is no less for any other eagerness.
-    let product = |q: &dyn Fn(usize) -> f64| {
-        let mut sums = [0.0; 2];
-        for (k, &n) in segments.iter().enumerate() {
-            let (n, variance) = (n as f64, doubts.variance(k));
-            sums[0] += n * (q(k) + 0.05);
-            sums[1] += n * variance * (0.06 + 1.0 / q(k) - 1.0);
-        }
-        sums[0] * sums[1]
-    };
-    let chosen = product(&|k| f64::from(chances.of(k as u8)) / 16.0);
-    for power in -8..24 {
-        let eagerness = 2f64.powf(0.5 * f64::from(power));
-        let other =
-            product(&|k| ((16.0 * eagerness * doubts.variance(k).sqrt()).ceil().clamp(1.0, 16.0)) / 16.0);
-        assert!(chosen <= other * 1.02, "2^{power}/2: {chosen} and {other}");
-    }
+    let mut rates = doubts.rates(0.06);
+    let mut demand = Demand::default();
+    // Cells of which a quarter is all doubt and the rest hardly any, and some of which nothing is in doubt.
+    let mixed: [f32; BINS] = std::array::from_fn(|bin| if bin % 4 == 0 { 0.5 } else { 1e-6 });
+    demand.add(&mixed, 100.0, &rates);
+    demand.add(&[0.0; BINS], 1000.0, &rates);
+    rates.choose(&demand, 0.0, 0.1);
+    let of: Vec<f32> = (0..CLASSES).map(|class| rates.of(class)).collect();
+    assert!(of.is_sorted_by(|a, b| a >= b), "{of:?}");
+    assert!(of[0] >= 1.0 && of[CLASSES - 1] == 0.5, "{of:?}");
+    let key = CellKey::new([0.0; 3], [0.0, 0.0, 1.0], 0, 0).expect("near");
+    let mut cell = MapCell::new(key, [0.0, 0.0, 1.0]);
+    cell.learn(Some(&mixed), &rates);
+    let density = |s: f32| cell.draw([s, 0.5]);
+    // Columns 0 and 4 are the doubtful ones.
+    let drawn: Vec<_> = (0..64).map(|k| density((k as f32 + 0.5) / 64.0)).collect();
+    let of_column = |column: u8| drawn.iter().filter(|drawn| drawn.bin % 8 == column).count();
+    assert!(of_column(0) > 2 * of_column(1) && of_column(4) > 2 * of_column(6));
+    let [left, usual] = cell.errors();
+    assert!(left < usual, "{left} and {usual}");
     let before = doubts;
     doubts.fade();
     assert_eq!(doubts.asked[3], before.asked[3] / 2);
@@ -310,7 +337,7 @@ fn assert_unbiased(setting: &Setting, name: &str, method: &dyn Visibility, refer
 /// An [`Auto`] whose map somebody tampers with after each pass.
 struct Tampered<F>(Auto, F);
 
-impl<F: Fn(&mut [MapCell], &mut Chances) + Sync> Visibility for Tampered<F> {
+impl<F: Fn(&mut [MapCell]) + Sync> Visibility for Tampered<F> {
     fn begin(&self, stage: &Stage<'_>, tiles: &[occlude_host::film::Tile], width: u32) {
         self.0.begin(stage, tiles, width);
         self.0.alter(&self.1);
@@ -346,30 +373,73 @@ fn pictures_are_right_on_average_whatever_the_map_holds() {
             assert_unbiased(&setting, &format!("{scene}, {what}"), method, &reference);
         };
         check("auto", &Auto::new(AutoOptions::default()));
+        check("auto that never sleeps", &Auto::new(AutoOptions::default()).restless());
         let small = AutoOptions { memory: 1 << 17, ..AutoOptions::default() };
         check("a map with room for few cells", &Auto::new(small));
         let empty = AutoOptions { memory: 0, ..AutoOptions::default() };
         check("an empty map", &Auto::new(empty));
         let large = AutoOptions { cell: 64.0, ..AutoOptions::default() };
         check("cells as large as half the picture", &Auto::new(large));
-        let least = |cells: &mut [MapCell], chances: &mut Chances| {
-            *chances = Chances::each(1);
-            cells.iter_mut().for_each(|cell| cell.learn(Some(&[0.5; BINS]), chances, 1.0));
+        let least = |cells: &mut [MapCell]| {
+            let rates = Rates::each(0.0);
+            cells.iter_mut().for_each(|cell| cell.learn(Some(&[0.5; BINS]), &rates));
+            assert!(cells.iter().all(|cell| cell.is_lit() || cell.part() == 1.0 / LEAST_CHANCE as f32));
         };
         check(
             "u of a half and the least chance everywhere",
-            &Tampered(Auto::new(AutoOptions::default()), least),
+            &Tampered(Auto::new(AutoOptions::default()).restless(), least),
         );
-        let wrong = |cells: &mut [MapCell], chances: &mut Chances| {
-            *chances = Chances::each(3);
+        let wrong = |cells: &mut [MapCell]| {
             let mut random = Random::new(cells.len() as u64);
             for cell in cells {
                 let odds: [f32; BINS] = std::array::from_fn(|_| random.unit());
-                cell.learn(Some(&odds), chances, 1.0);
+                cell.learn(Some(&odds), &rates(&mut random));
             }
         };
-        check("u at random", &Tampered(Auto::new(AutoOptions::default()), wrong));
+        check("u at random", &Tampered(Auto::new(AutoOptions::default()).restless(), wrong));
+        let other = Setting::own("plates", size);
+        let auto = Auto::new(AutoOptions::default()).restless();
+        other.passes(&auto, 6, 32);
+        let foreign = other.with_stage(32, detect(), |stage| auto.save(stage));
+        assert!(foreign.cells() > 20);
+        setting.with_stage(16, detect(), |stage| {
+            let refused = foreign.check("a.map", stage).expect_err("another scene");
+            assert!(refused.to_string().contains("belongs to other triangles"), "{refused}");
+        });
+        check("a map of another scene", &Auto::with_saved(AutoOptions::default(), foreign).restless());
+        let auto = Auto::new(AutoOptions::default());
+        setting.passes(&auto, 4, 16);
+        let own = setting.with_stage(16, detect(), |stage| auto.save(stage));
+        check("a map that has learned before", &Auto::with_saved(AutoOptions::default(), own).restless());
     }
+}
+
+/// A map that has learned helps from the first pass on.
+#[test]
+fn what_was_learned_before_is_used_and_takes_no_more_memory_than_it_may() {
+    let setting = Setting::own("cornell", (72, 72));
+    let auto = Auto::new(AutoOptions::default());
+    setting.passes(&auto, 6, 64);
+    let saved = setting.with_stage(64, detect(), |stage| auto.save(stage));
+    let error = |auto: &Auto| {
+        let passes = setting.passes(auto, 2, 64);
+        let truth = setting.passes(&Exact, 2, 1024);
+        let off = |(a, b): (&Image, &Image)| -> f64 {
+            let pairs = a.pixels.iter().flatten().zip(b.pixels.iter().flatten());
+            pairs.map(|(a, b)| f64::from(a - b).powi(2)).sum()
+        };
+        passes.iter().zip(&truth).map(off).sum::<f64>()
+    };
+    let (fresh, learned) =
+        (Auto::new(AutoOptions::default()), Auto::with_saved(AutoOptions::default(), saved.clone()));
+    let (before, after) = (error(&fresh), error(&learned));
+    assert!(after < 0.8 * before, "{after} and {before}");
+    let history = learned.history();
+    assert!(history[0].odds + history[0].lit + history[0].left_alone > 0.8, "{:?}", history[0]);
+    let small = AutoOptions { memory: 1 << 16, ..AutoOptions::default() };
+    let tight = Auto::with_saved(small, saved);
+    setting.passes(&tight, 2, 64);
+    assert!(tight.bytes() <= 2 << 16, "{} bytes", tight.bytes());
 }
 
 #[test]

@@ -1,9 +1,10 @@
 //! Methods beside each other: the same camera samples, their errors, and the time they take.
 
+use crate::clock;
 use crate::film::{Film, Image};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, MapOptions, PreparedMap, Scratch, Settings, Stage, StageTimes, Stochastic,
-    Visibility, render_tile,
+    Auto, AutoOptions, Exact, Learned, MapOptions, PreparedMap, Scratch, Settings, Stage, StageTimes,
+    Stochastic, Visibility, render_tile,
 };
 use crate::metrics::flip;
 use crate::page::{
@@ -19,7 +20,7 @@ use std::time::Instant;
 pub const MAKER: &str = "occlude compare-methods";
 
 /// The files beside the page.
-pub const FILES: [&str; 2] = ["methods.csv", "passes.csv"];
+pub const FILES: [&str; 3] = ["methods.csv", "passes.csv", "learned.csv"];
 
 /// A way to find visibility.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -67,8 +68,16 @@ struct Runner<'a> {
     /// Before the first pass and in passes, s.
     seconds: f64,
     prepared: f64,
-    /// Passes, time and error, from time to time.
-    history: Vec<(u32, f64, f64)>,
+    /// From time to time.
+    history: Vec<Moment>,
+}
+
+/// What there was after some passes.
+struct Moment {
+    passes: u32,
+    seconds: f64,
+    error: f64,
+    image: Image,
 }
 
 impl<'a> Runner<'a> {
@@ -79,16 +88,16 @@ impl<'a> Runner<'a> {
     }
 
     fn begin(&mut self, stage: &Stage<'_>) {
-        let start = Instant::now();
+        let start = clock::of_process();
         let tiles: Vec<_> = self.film.tiles().iter().map(|tile| tile.tile()).collect();
         self.visibility.begin(stage, &tiles, self.film.width());
-        let spent = start.elapsed().as_secs_f64();
+        let spent = (clock::of_process() - start).as_secs_f64();
         self.seconds += spent;
         self.prepared += spent;
     }
 
     fn pass(&mut self, stage: &Stage<'_>, pass: u32) {
-        let start = Instant::now();
+        let start = clock::of_process();
         let Self { visibility, film, scratches, .. } = self;
         let width = film.width();
         film.tiles_mut().par_iter_mut().for_each(|tile| {
@@ -97,7 +106,7 @@ impl<'a> Runner<'a> {
             render_tile(stage, &**visibility, width, pass, tile, &mut scratch);
         });
         visibility.passed(stage);
-        self.seconds += start.elapsed().as_secs_f64();
+        self.seconds += (clock::of_process() - start).as_secs_f64();
     }
 
     fn times(&self) -> StageTimes {
@@ -120,6 +129,9 @@ enum Class {
 
 const CLASSES: [(Class, &str); 3] =
     [(Class::Lit, "lit"), (Class::Dark, "dark"), (Class::Penumbra, "penumbra")];
+
+/// Pictures are kept of so many passes, and of the last.
+const ALL_UNTIL: u32 = 32;
 
 /// Runs the methods over a scene and writes a page. Errors are those of the shadow rays alone: the reference has the same
 /// camera samples, and many rays for each.
@@ -145,17 +157,18 @@ fn compare(
     let began = Instant::now();
     let size = comparison.size;
     let prepared = {
-        let start = Instant::now();
+        let start = clock::of_process();
         let wanted = comparison.methods.contains(&Method::Map);
-        wanted.then(|| (PreparedMap::new(stage, options), start.elapsed().as_secs_f64()))
+        wanted.then(|| (PreparedMap::new(stage, options), (clock::of_process() - start).as_secs_f64()))
     };
     let map = prepared.as_ref().map(|(prepared, seconds)| (prepared, *seconds));
+    let learner = Auto::new(AutoOptions::default());
     let mut runners = Vec::new();
     for &method in &comparison.methods {
-        let start = Instant::now();
+        let start = clock::of_process();
         let (visibility, before): (Box<dyn Visibility + '_>, f64) = match method {
             Method::Exact => (Box::new(Exact), 0.0),
-            Method::Auto => (Box::new(Auto::new(AutoOptions::default())), 0.0),
+            Method::Auto => (Box::new(&learner), 0.0),
             Method::Stochastic => {
                 (Box::new(Stochastic::new(Settings::default(), stage.scene, &stage.bvh)?), 0.0)
             }
@@ -164,7 +177,8 @@ fn compare(
                 (Box::new(map.visibility()), seconds)
             }
         };
-        runners.push(Runner::new(method, visibility, size, before + start.elapsed().as_secs_f64()));
+        let spent = (clock::of_process() - start).as_secs_f64();
+        runners.push(Runner::new(method, visibility, size, before + spent));
     }
     runners.iter_mut().for_each(|runner| runner.begin(stage));
 
@@ -181,11 +195,16 @@ fn compare(
             run.go_on()?;
             runner.pass(stage, pass);
         }
-        if (pass + 1).is_power_of_two() || pass + 1 == comparison.passes {
+        let passes = pass + 1;
+        if passes <= ALL_UNTIL || passes.is_power_of_two() || passes == comparison.passes {
             let truth = reference.film.develop();
             for runner in &mut runners {
-                let error = rmse(&runner.film.develop(), &truth, |_| true);
-                runner.history.push((pass + 1, runner.seconds, error));
+                let image = runner.film.develop();
+                let error = rmse(&image, &truth, |_| true);
+                // Pictures of other passes are not shown.
+                let image =
+                    if passes <= ALL_UNTIL || passes == comparison.passes { image } else { Image::default() };
+                runner.history.push(Moment { passes, seconds: runner.seconds, error, image });
             }
         }
     }
@@ -265,8 +284,8 @@ fn compare(
     page.section("Gain");
     page.add(&table);
     page.prose(
-        "Visibility and light samples are summed over threads, the whole is on the clock, with what came before the first \
-         pass. The map is biased: more passes do not take its error away.",
+        "Times are those that threads worked, summed: whoever else uses the machine is not in them. The whole has all in it, \
+         with what came before the first pass. The map is biased: more passes do not take its error away.",
     );
     page.data(FILES[0], "one line a method");
 
@@ -274,17 +293,32 @@ fn compare(
     let mut passes = Data::new(&["method", "passes", "seconds", "rmse"]);
     let mut plot = Plot::new("", Axis::log("seconds"), Axis::log("RMSE"));
     for (k, runner) in runners.iter().enumerate() {
-        let points = runner.history.iter().map(|&(_, seconds, error)| (seconds, error));
+        let points = runner.history.iter().map(|moment| (moment.seconds, moment.error));
         plot = plot.series(Series::new(runner.method.name(), k, points));
-        for &(pass, seconds, error) in &runner.history {
-            let numbers = [f64::from(pass), seconds, error].map(|value| format!("{value:.6e}"));
+        for moment in &runner.history {
+            let numbers =
+                [f64::from(moment.passes), moment.seconds, moment.error].map(|value| format!("{value:.6e}"));
             passes.row(std::iter::once(runner.method.name().to_owned()).chain(numbers));
         }
     }
     page.add(
-        &Figure::new("After 1, 2, 4, 8 and so on passes", "Lower and to the left is better.").plot(plot),
+        &Figure::new(
+            "After each pass up to the 32nd, and after 64, 128 and so on",
+            "Lower and to the left is better.",
+        )
+        .plot(plot),
     );
-    page.data(FILES[1], "a line for each method after 1, 2, 4 and so on passes");
+    page.data(FILES[1], "a line for each method and point");
+    let mut each = Plot::new("", Axis::linear("pass"), Axis::linear("seconds"));
+    for (k, runner) in runners.iter().enumerate() {
+        let pairs = runner.history.windows(2).filter(|pair| pair[1].passes == pair[0].passes + 1);
+        let points = pairs.map(|pair| (f64::from(pair[1].passes), pair[1].seconds - pair[0].seconds));
+        each = each.series(Series::new(runner.method.name(), k, points));
+    }
+    if comparison.passes > 2 {
+        page.add(&Figure::new("Time of each pass", "From the second on.").plot(each));
+    }
+    equals(&mut page, &runners, &truth)?;
 
     page.section("Where");
     let mut by_class = Table::new("RMSE by what the exact method says of a pixel's first camera sample")
@@ -305,6 +339,32 @@ fn compare(
         by_class.row(row);
     }
     page.add(&by_class);
+
+    let mut beside = Table::new("Squared error against that of the first method")
+        .words("method")
+        .numbers("lit")
+        .numbers("dark")
+        .numbers("penumbra");
+    for (runner, image) in runners.iter().zip(&images).skip(1) {
+        let mut row = vec![Entry::from(runner.method.name())];
+        row.extend(CLASSES.map(|(class, _)| {
+            let of = |image: &Image| rmse(image, &truth, |pixel| classes[pixel] == class).powi(2);
+            Entry::number(of(image) / of(&images[0]), 3)
+        }));
+        beside.row(row);
+    }
+    if runners.len() > 1 {
+        page.add(&beside);
+    }
+
+    let auto = comparison.methods.iter().position(|&method| method == Method::Auto);
+    let learned = match auto {
+        Some(k) => {
+            let gain = figures[0].0[0] * figures[0].1.powi(2) / (figures[k].0[0] * figures[k].1.powi(2));
+            learning(&mut page, stage, &learner, size, gain)
+        }
+        None => Data::new(&LEARNED),
+    };
 
     page.section("Pictures");
     let crop = busiest(&truth);
@@ -350,7 +410,156 @@ fn compare(
         occlude_kernel::lanes::level_name(run.level),
         run.seed,
     );
-    Ok(Reproduced { page, foot, data: vec![(FILES[0], data), (FILES[1], passes)] })
+    Ok(Reproduced { page, foot, data: vec![(FILES[0], data), (FILES[1], passes), (FILES[2], learned)] })
+}
+
+/// Pictures after the same time, and with the same error.
+fn equals(page: &mut Page, runners: &[Runner<'_>], truth: &Image) -> Result<(), Halted> {
+    page.section("The same time, the same error");
+    let crop = busiest(truth);
+    let time = runners.iter().map(|runner| runner.seconds).fold(f64::INFINITY, f64::min);
+    let nearest = |runner: &Runner<'_>| {
+        let off = |moment: &Moment| (moment.seconds / time).ln().abs();
+        (0..runner.history.len())
+            .filter(|&k| !runner.history[k].image.pixels.is_empty())
+            .min_by(|&a, &b| off(&runner.history[a]).total_cmp(&off(&runner.history[b])))
+    };
+    // The least error that all have got to; of a biased method not more than it ever gets to.
+    let last = |runner: &Runner<'_>| runner.history.last().map_or(f64::INFINITY, |moment| moment.error);
+    let error = runners.iter().filter(|runner| runner.method != Method::Map).map(last).fold(0.0, f64::max);
+    let first = |runner: &Runner<'_>| {
+        (0..runner.history.len())
+            .find(|&k| runner.history[k].error <= error && !runner.history[k].image.pixels.is_empty())
+    };
+    let mut table =
+        Table::new("The first pass with no more error than the worst has in the end, and its time")
+            .words("method")
+            .numbers("passes")
+            .numbers("RMSE")
+            .numbers("seconds");
+    let names = runners.iter().map(|runner| runner.method.name().to_owned());
+    let mut strip = Strip::new(
+        format!("After {time:.3} s each, and with an RMSE of {} each", number(error, 3)),
+        "As near as whole passes come.",
+        names,
+    )
+    .crops([("where there is most going on".to_owned(), crop)]);
+    for (name, which) in
+        [("equal time", &nearest as &dyn Fn(&Runner<'_>) -> Option<usize>), ("equal error", &first)]
+    {
+        let mut pictures = Vec::new();
+        for runner in runners {
+            let Some(moment) = which(runner).map(|k| &runner.history[k]) else {
+                let nothing = Image::from_fn(truth.width, truth.height, |_, _| [0.2; 3]);
+                pictures
+                    .push(Picture::new(&nothing, 0.0, "never").crops(&nothing, 0.0, &[crop]).under("never"));
+                continue;
+            };
+            let seen = flip::flip(&moment.image, truth, 0.0, flip::PIXELS_PER_DEGREE)?;
+            let under = format!(
+                "{} passes, {} s, RMSE {}, FLIP {}",
+                moment.passes,
+                number(moment.seconds, 3),
+                number(moment.error, 3),
+                number(seen.mean, 3)
+            );
+            let words = format!("{}, {name}", runner.method.name());
+            pictures.push(
+                Picture::new(&moment.image, 0.0, words).crops(&moment.image, 0.0, &[crop]).under(under),
+            );
+        }
+        strip.row(name, pictures);
+    }
+    for runner in runners {
+        let mut row = vec![Entry::from(runner.method.name())];
+        row.extend(match first(runner).map(|k| &runner.history[k]) {
+            Some(moment) => [
+                Entry::from(moment.passes.to_string()),
+                Entry::number(moment.error, 3),
+                Entry::number(moment.seconds, 3),
+            ],
+            None => [Entry::from("never"), Entry::from(""), Entry::from("")],
+        });
+        table.row(row);
+    }
+    page.add(&table);
+    page.add(&strip);
+    Ok(())
+}
+
+const LEARNED: [&str; 9] =
+    ["passes", "cells", "lit", "odds", "left_alone", "part", "doubt", "promise", "asleep"];
+
+/// What the map that learns knew, and when.
+fn learning(page: &mut Page, stage: &Stage<'_>, auto: &Auto, size: (u32, u32), gain: f64) -> Data {
+    page.section("What the map knows");
+    let history = auto.history();
+    let mut data = Data::new(&LEARNED);
+    let mut table = Table::new("After some passes, by the points that ask")
+        .numbers("passes")
+        .numbers("cells")
+        .numbers("proven lit, %")
+        .numbers("odds, %")
+        .numbers("left to exact, %")
+        .numbers("samples where odds, %")
+        .numbers("variance of V - u")
+        .numbers("promised gain");
+    for lesson in &history {
+        let shares = [lesson.lit, lesson.odds, lesson.left_alone, lesson.part];
+        let mut row = vec![Entry::from(lesson.passes.to_string()), Entry::from(lesson.cells.to_string())];
+        row.extend(shares.map(|share| Entry::number(100.0 * share, 3)));
+        row.extend([Entry::number(lesson.doubt, 3), Entry::number(lesson.promise, 3)]);
+        table.row(row);
+        let numbers = [shares[0], shares[1], shares[2], shares[3], lesson.doubt, lesson.promise];
+        data.row(
+            [lesson.passes.to_string(), lesson.cells.to_string()]
+                .into_iter()
+                .chain(numbers.iter().map(|value| format!("{value:.6e}")))
+                .chain([u8::from(lesson.asleep).to_string()]),
+        );
+    }
+    page.add(&table);
+    page.data(FILES[2], "one line a lesson");
+    let promise = history.last().map_or(1.0, |lesson| lesson.promise);
+    let slept = history.iter().find(|lesson| lesson.asleep);
+    page.facts([
+        ("memory of the map", format!("{:.1} MB", auto.bytes() as f64 / 1e6)),
+        ("gain of visibility, promised after the last lesson", number(promise, 3)),
+        ("and measured, over all passes", number(gain, 3)),
+        ("asleep", slept.map_or_else(|| "no".to_owned(), |lesson| format!("after pass {}", lesson.passes))),
+    ]);
+    let share = |which: &dyn Fn(&Learned) -> f64| -> Vec<(f64, f64)> {
+        history.iter().map(|lesson| (f64::from(lesson.passes), 100.0 * which(lesson))).collect()
+    };
+    let plot = Plot::new("", Axis::linear("passes"), Axis::linear("% of the points"))
+        .series(Series::new("proven lit", 0, share(&|lesson| lesson.lit)))
+        .series(Series::new("odds", 1, share(&|lesson| lesson.odds)))
+        .series(Series::new("left to the exact method", 2, share(&|lesson| lesson.left_alone)));
+    page.add(&Figure::new("Who answers", "The rest is not known yet.").plot(plot));
+
+    let mut seen = vec![[f64::NAN; 3]; size.0 as usize * size.1 as usize];
+    let mut scratch = Scratch::default();
+    for tile in Film::new(size.0, size.1).tiles() {
+        let tile = tile.tile();
+        for (pixel, values) in auto.survey(stage, tile, size.0, &mut scratch).iter().enumerate() {
+            let (x, y) = tile.position(pixel);
+            seen[y as usize * size.0 as usize + x as usize] = values.map(f64::from);
+        }
+    }
+    let mut gallery = Gallery::new(
+        "Where",
+        "Of the light that a pixel's first camera sample would get with nothing in the way.",
+    )
+    .ramp(0.0, 1.0, "part");
+    for (k, name) in ["proven lit", "samples asked for, of the usual ones", "left to the exact method"]
+        .into_iter()
+        .enumerate()
+    {
+        let values: Vec<f64> = seen.iter().map(|values| values[k]).collect();
+        gallery.picture(name, Picture::new(&heat(&values, size.0, size.1, 0.0, 1.0), 0.0, name));
+    }
+    page.add(&gallery);
+    data
 }
 
 /// Over pixels and channels.

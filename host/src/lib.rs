@@ -2,6 +2,7 @@
 
 pub mod accel;
 pub mod cli;
+pub mod clock;
 pub mod compare_methods;
 pub mod error;
 pub mod film;

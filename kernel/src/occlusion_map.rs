@@ -5,22 +5,23 @@
 //!
 //! - *lit*: a shaft around all of the cell's points and the light met nothing. Exact: no ray is needed;
 //! - *odds*: the light is cut into bins, and each has u, the part of the segments that were free so far, and a class of
-//!   doubt, which says with what chance q one is worth a ray;
-//! - nothing, or nothing that helps: every segment is asked.
+//!   doubt, which says how far V is from u there;
+//! - nothing, or nothing that helps: segments are asked as if there were no map.
 //!
-//! With odds the estimate of a segment's visibility V is
+//! With odds, what arrives from the light is
 //!
 //! ```text
-//!     u + (V - u)/q    with chance q,        u    otherwise,
+//!     integral of V w  =  integral of u g  +  mean over samples y of  (V w - u g)(y)/p(y),
 //! ```
 //!
-//! which is [`Residual`](crate::Decomposition::Residual) with nothing in its first group. It is right on average for any u and any q
-//! above 0, as long as they do not depend on the segment at hand; its variance is `(1/q - 1) E[(V - u)²]`. Where a bin
-//! is all dark or all free, as most are away from the borders of shadows, that is next to nothing even for a small q:
-//! so the rays go where shadows begin and end, on the surfaces and on the light.
+//! where w is what each point of the light would send, and g something near it whose integral is known. The samples have
+//! the density p, which follows the doubt: few where V is as good as known, many where shadows begin and end. That
+//! is right on average for any u, any g and any p above 0 that do not depend on the samples at hand; it is
+//! [`Residual`](crate::Decomposition::Residual) with nothing in its first group, the chance q spread over the light. Where a bin is all dark
+//! or all free, as most are away from the borders of shadows, what is left to sample is next to nothing.
 //!
-//! How far the doubts are right is itself measured: [`Doubts`] sums `(V - u)²` for each class, and [`Doubts::chances`]
-//! turns that into the q of each class.
+//! How far the doubts are right is itself measured: [`Doubts`] sums `(V - u)²` for each class, and [`Doubts::rates`]
+//! turns that into densities.
 //!
 //! Nothing here is written while it is read, and no number is drawn: the caller collects what rays saw in [`Tally`]s,
 //! and makes new odds of them ([`MapCell::learn`]) between passes.
@@ -35,8 +36,9 @@ pub const BIN_EDGE: usize = 8;
 /// Bins of a light.
 pub const BINS: usize = BIN_EDGE * BIN_EDGE;
 
-/// No chance is below one in this many, so that no weight is above it.
-pub const LEAST_CHANCE: u32 = 16;
+/// No part of a light gets fewer samples than one in this many of those it would get without a map, so that no weight
+/// is more than this many times what it would be.
+pub const LEAST_CHANCE: u32 = 32;
 
 /// The bin of a light's point by its coordinates on the unit square, as light samples have them.
 #[inline]
@@ -91,6 +93,24 @@ impl CellKey {
         (bits >> 23) as i32 - 127 + i32::from(bits & 0x7f_ffff != 0)
     }
 
+    /// The same cell for another light. `None` where a key cannot name it.
+    #[inline]
+    pub fn with_light(self, light: u32) -> Option<Self> {
+        (light < Self::LIGHTS).then_some(Self(self.0 & ((1 << 51) - 1) | u64::from(light) << 51))
+    }
+
+    /// As a number, and back. Every number is the key of some cell.
+    #[inline]
+    pub fn bits(self) -> u64 {
+        self.0
+    }
+
+    /// The key of a number that [`CellKey::bits`] gave.
+    #[inline]
+    pub fn from_bits(bits: u64) -> Self {
+        Self(bits)
+    }
+
     /// The light.
     #[inline]
     pub fn light(self) -> u32 {
@@ -124,14 +144,28 @@ pub struct MapCell {
     lower: [f32; 3],
     upper: [f32; 3],
     state: u32,
-    spare: [u8; 4],
-    /// What all bins share, if they do: u in units of 1/255, and the class; and whether they do.
-    flat: [u8; 4],
+    /// Are all bins alike?
+    flat: u32,
+    /// What part of the usual number of samples it is worth.
+    part: f32,
+    /// The variance that these leave, and what the usual samples would, in units of a sample's.
+    error: f32,
+    usual: f32,
+    /// The mean of u, in units of 1/255.
+    mean: f32,
+    spare: u32,
+    /// How many of 64 equal parts of the unit interval belong to the columns of bins up to each one.
+    columns: [u8; BIN_EDGE],
+    /// And within each column, to the rows up to each one.
+    rows: [[u8; BIN_EDGE]; BIN_EDGE],
     /// u, in units of 1/255.
     u: [u8; BINS],
     /// Classes of doubt.
     class: [u8; BINS],
 }
+
+/// The same for all.
+const EVEN: [u8; BIN_EDGE] = [8, 16, 24, 32, 40, 48, 56, 64];
 
 const NOTHING: u32 = 0;
 const ODDS: u32 = 1;
@@ -139,18 +173,67 @@ const LIT: u32 = 2;
 const ALL: u32 = 3;
 
 /// What a cell says of the segments to its light.
-#[derive(Clone, Copy, Debug, PartialEq)]
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
 pub enum Known {
-    /// Nothing: ask.
+    /// Nothing: ask, and tell what they saw.
     Nothing,
-    /// That most segments are worth a ray: asking all costs no more. No need to tell what they saw.
+    /// That doubt is everywhere: asking as if there were no map is as good. No need to tell what they saw.
     All,
     /// All of them are free.
     Lit,
-    /// The same for all bins.
-    Flat(Odds),
-    /// [`MapCell::odds`] has them.
-    Bins,
+    /// [`MapCell::odds`] and [`MapCell::draw`].
+    Odds,
+}
+
+/// A sample of the light that follows a cell's density.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Drawn {
+    /// Where, on the unit square.
+    pub at: [f32; 2],
+    /// In which bin.
+    pub bin: u8,
+    /// How many times as likely it is as with an even density.
+    pub density: f32,
+}
+
+/// Parts that the unit interval is cut into, to share among columns and among rows.
+const PARTS: usize = 64;
+
+/// Each column has this many of them at least, and each row of a column one: a density of `1 / LEAST_CHANCE`.
+const LEAST_PARTS: usize = 2;
+const _: () = assert!(PARTS * PARTS / (BINS * LEAST_PARTS) == LEAST_CHANCE as usize);
+
+/// Shares the parts in proportion to the weights, with at least `least` for each; all alike where there are none.
+fn share(weights: &[f32; BIN_EDGE], least: usize) -> [u8; BIN_EDGE] {
+    let mut total = 0.0;
+    for &weight in weights {
+        total += weight;
+    }
+    let rest = (PARTS - least * BIN_EDGE) as f32;
+    let mut ends = [0; BIN_EDGE];
+    let mut sum = 0.0;
+    for (i, end) in ends.iter_mut().enumerate() {
+        sum += weights[i];
+        let part = if total > 0.0 { sum / total } else { (i + 1) as f32 / BIN_EDGE as f32 };
+        *end = (least * (i + 1)) as u8 + (rest * part.min(1.0) + 0.5) as u8;
+    }
+    ends[BIN_EDGE - 1] = PARTS as u8;
+    ends
+}
+
+/// Which of the shares a number in [0, 1) falls into, where in it, and how many parts it has.
+#[inline(always)]
+fn place(ends: [u8; BIN_EDGE], at: f32) -> (usize, f32, f32) {
+    let at = at * PARTS as f32;
+    let part = (at as u64).min(PARTS as u64 - 1);
+    let ends = u64::from_le_bytes(ends);
+    // A byte's highest bit stays where its end is not beyond the part.
+    let ones = 0x0101_0101_0101_0101;
+    let before = ((part | 0x80) * ones - ends) & (0x80 * ones);
+    let index = before.count_ones() as usize & (BIN_EDGE - 1);
+    let start = ((ends << 8) >> (8 * index)) as u8;
+    let width = f32::from(((ends >> (8 * index)) as u8).wrapping_sub(start));
+    (index, (at - f32::from(start)) / width, width)
 }
 
 impl MapCell {
@@ -163,8 +246,14 @@ impl MapCell {
             lower: [f32::INFINITY; 3],
             upper: [f32::NEG_INFINITY; 3],
             state: NOTHING,
-            spare: [0; 4],
-            flat: [0; 4],
+            flat: 1,
+            part: 1.0,
+            error: 1.0,
+            usual: 1.0,
+            mean: 0.0,
+            spare: 0,
+            columns: EVEN,
+            rows: [EVEN; BIN_EDGE],
             u: [0; BINS],
             class: [0; BINS],
         }
@@ -174,6 +263,19 @@ impl MapCell {
     #[inline]
     pub fn key(&self) -> CellKey {
         self.key
+    }
+
+    /// About where its surface faces, and the bounds of its points in the frame of that; to be kept, for
+    /// [`MapCell::restore`].
+    pub fn bounds(&self) -> [[f32; 3]; 3] {
+        [self.normal, self.lower, self.upper]
+    }
+
+    /// A cell of which nothing is known, with bounds that [`MapCell::bounds`] gave. `None` if no cell can have them.
+    pub fn restore(key: CellKey, [normal, lower, upper]: [[f32; 3]; 3]) -> Option<Self> {
+        let unit = (Vec3::from(normal).length_squared() - 1.0).abs() < 1e-3;
+        let finite = lower.iter().chain(&upper).all(|at| at.is_finite());
+        (unit && finite).then(|| Self { lower, upper, normal, ..Self::new(key, normal) })
     }
 
     /// A position in the frame of the normal.
@@ -223,9 +325,21 @@ impl MapCell {
         corners
     }
 
-    /// Says that every segment from within its bounds is free: proven, and not for all one has seen.
+    /// Says that every segment from within its bounds is free: proven, and not for all one has seen. What is thought of
+    /// other segments is that they will be.
     pub fn set_lit(&mut self) {
+        self.set_odds(&[1.0; BINS], &Rates::each(LIT_PART));
         self.state = LIT;
+    }
+
+    /// Knows nothing any more but its bounds.
+    pub fn forget(&mut self) {
+        *self = Self { lower: self.lower, upper: self.upper, ..Self::new(self.key, self.normal) };
+    }
+
+    /// Says that the map does not help here.
+    pub fn set_all(&mut self) {
+        self.state = ALL;
     }
 
     /// Is it proven to be lit?
@@ -245,10 +359,8 @@ impl MapCell {
     pub fn known(&self, x: impl Into<[f32; 3]>) -> Known {
         match self.state {
             LIT if self.covers(x) => Known::Lit,
-            LIT => Known::Flat(Odds { u: 255, class: CLASSES as u8 - 1 }),
-            ODDS if self.flat[2] == 1 => Known::Flat(Odds { u: self.flat[0], class: self.flat[1] }),
+            LIT | ODDS => Known::Odds,
             ALL => Known::All,
-            ODDS => Known::Bins,
             _ => Known::Nothing,
         }
     }
@@ -257,6 +369,44 @@ impl MapCell {
     #[inline(always)]
     pub fn odds(&self, bin: usize) -> Odds {
         Odds { u: self.u[bin], class: self.class[bin] }
+    }
+
+    /// Are all bins alike? Then the density is even.
+    #[inline(always)]
+    pub fn is_flat(&self) -> bool {
+        self.flat == 1
+    }
+
+    /// The mean of u over the light.
+    #[inline(always)]
+    pub fn mean(&self) -> f32 {
+        self.mean * (1.0 / 255.0)
+    }
+
+    /// What part of the usual number of samples it is worth, at most 1. Together with the density no bin has less than
+    /// `1 / LEAST_CHANCE` of the usual samples.
+    #[inline(always)]
+    pub fn part(&self) -> f32 {
+        self.part
+    }
+
+    /// The variance that its samples are thought to leave, and the usual ones, in units of a sample's.
+    #[inline(always)]
+    pub fn errors(&self) -> [f32; 2] {
+        [self.error, self.usual]
+    }
+
+    /// The sample for a point of the unit square. For even points its density is [`Drawn::density`].
+    #[inline(always)]
+    pub fn draw(&self, [s, t]: [f32; 2]) -> Drawn {
+        let (column, x, parts) = place(self.columns, s);
+        let (row, y, others) = place(self.rows[column & (BIN_EDGE - 1)], t);
+        let edge = 1.0 / BIN_EDGE as f32;
+        Drawn {
+            at: [(column as f32 + x) * edge, (row as f32 + y) * edge],
+            bin: (row * BIN_EDGE + column) as u8,
+            density: parts * others * (BINS as f32 / (PARTS * PARTS) as f32),
+        }
     }
 
     /// The part of each bin's segments that one expects to be free, by everything that rays have seen so far; `None` if
@@ -301,26 +451,202 @@ impl MapCell {
     }
 
     /// Makes odds of what one expects, p: u is p, or 0 where p is below a half, so that dark places do not become
-    /// negative; and the class of doubt follows from the variance p (1 - p). Nothing to expect, and a cell knows
-    /// nothing. What is lit stays so.
-    ///
-    /// Where more than this part of the rays would be asked, all are from then on.
-    pub fn learn(&mut self, expected: Option<&[f32; BINS]>, chances: &Chances, most: f32) {
-        let Some(expected) = expected.filter(|_| self.state != LIT) else {
-            self.state = if self.state == LIT { LIT } else { NOTHING };
+    /// negative; the class of doubt follows from the variance p (1 - p), and the density from the rates of the classes.
+    /// Nothing to expect, and a cell knows nothing. What is lit stays so.
+    pub fn learn(&mut self, expected: Option<&[f32; BINS]>, rates: &Rates) {
+        if self.state == LIT {
             return;
-        };
-        let mut sum = 0;
+        }
+        match expected {
+            None => self.state = NOTHING,
+            Some(expected) => {
+                self.set_odds(expected, rates);
+                self.state = ODDS;
+            }
+        }
+    }
+
+    fn set_odds(&mut self, expected: &[f32; BINS], rates: &Rates) {
+        let mut mean = 0.0;
         for (bin, &p) in expected.iter().enumerate() {
             self.u[bin] = if p < 0.5 { 0 } else { (p * 255.0 + 0.5) as u8 };
             self.class[bin] = class(p) as u8;
-            sum += u32::from(chances.of(self.class[bin]));
+            mean += f32::from(self.u[bin]);
         }
+        self.mean = mean / BINS as f32;
         let alike =
             self.u.iter().all(|&u| u == self.u[0]) && self.class.iter().all(|&class| class == self.class[0]);
-        self.flat = [self.u[0], self.class[0], u8::from(alike), 0];
-        let asked = sum as f32 / (LEAST_CHANCE as usize * BINS) as f32;
-        self.state = if asked > most { ALL } else { ODDS };
+        self.flat = u32::from(alike);
+        let plan = rates.plan(expected);
+        let level = if plan.unsure(rates, rates.best) { plan.level } else { rates.best };
+        let part = plan.mean(rates, level);
+        let rate = |class: u8| rates.of[level][usize::from(class) & (CLASSES - 1)];
+        let mut columns = [0.0; BIN_EDGE];
+        for (bin, &class) in self.class.iter().enumerate() {
+            columns[bin % BIN_EDGE] += rate(class);
+        }
+        self.columns = share(&columns, LEAST_PARTS);
+        let mut densities = [0.0; BINS];
+        let mut least = f32::INFINITY;
+        let mut from = 0;
+        for column in 0..BIN_EDGE {
+            let mut rows = [0.0; BIN_EDGE];
+            for (row, weight) in rows.iter_mut().enumerate() {
+                *weight = rate(self.class[row * BIN_EDGE + column]);
+            }
+            self.rows[column] = share(&rows, 1);
+            let mut above = 0;
+            for row in 0..BIN_EDGE {
+                let parts =
+                    f32::from(self.columns[column] - from) * f32::from(self.rows[column][row] - above);
+                let density = parts * (BINS as f32 / (PARTS * PARTS) as f32);
+                densities[row * BIN_EDGE + column] = density;
+                least = density.min(least);
+                above = self.rows[column][row];
+            }
+            from = self.columns[column];
+        }
+        self.part = part.clamp(1.0 / (LEAST_CHANCE as f32 * least), 1.0);
+        (self.error, self.usual) = (0.0, 0.0);
+        for (density, &class) in densities.iter().zip(&self.class) {
+            let variance = rates.variance[usize::from(class) & (CLASSES - 1)];
+            self.error += variance * left(density * self.part, rates.spread) / BINS as f32;
+            self.usual += variance * rates.spread / BINS as f32;
+        }
+    }
+}
+
+/// The part of the usual samples of segments that are free as far as one knows.
+const LIT_PART: f32 = 0.5;
+
+/// What samples leave of a variance, with this part of the usual number. Well spread samples find most of what differs
+/// from bin to bin, and only `spread` is left; but only if there are enough to ask in every bin.
+fn left(rate: f32, spread: f32) -> f32 {
+    if rate >= 1.0 { spread / (rate * libm::sqrtf(rate)) } else { 1.0 / rate - 1.0 + spread }
+}
+
+/// How many rates there are to choose from.
+pub const LEVELS: usize = 32;
+
+/// What part of the usual number of samples bins get, by their class of doubt.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Rates {
+    /// For less and less doubt, so that there are more and more.
+    of: [[f32; CLASSES]; LEVELS],
+    best: usize,
+    variance: [f32; CLASSES],
+    spread: f32,
+}
+
+impl Rates {
+    /// The same for all.
+    pub fn each(rate: f32) -> Self {
+        let variance = [UNSURE as f32; CLASSES];
+        Self { of: [[rate; CLASSES]; LEVELS], best: 0, variance, spread: 1.0 }
+    }
+
+    /// Of a class, where nothing limits them.
+    pub fn of(&self, class: usize) -> f32 {
+        self.of[self.best][class & (CLASSES - 1)]
+    }
+
+    /// What the usual samples leave of the variance that bins have by themselves.
+    pub fn spread(&self) -> f32 {
+        self.spread
+    }
+
+    fn plan(&self, expected: &[f32; BINS]) -> Plan {
+        let mut plan = Plan { members: [0; CLASSES], level: LEVELS - 1, worst: CLASSES - 1 };
+        for &p in expected {
+            plan.members[class(p)] += 1;
+            plan.worst = plan.worst.min(class(p));
+        }
+        while plan.level > 0 && plan.mean(self, plan.level) > 1.0 {
+            plan.level -= 1;
+        }
+        plan
+    }
+
+    /// Chooses the rates that make the product of work and squared error least.
+    ///
+    /// `unknown` points are asked as usual, and a point costs `overhead` times as much as usual before it is asked.
+    pub fn choose(&mut self, demand: &Demand, unknown: f64, overhead: f64) {
+        let mut least = f64::INFINITY;
+        for level in 0..LEVELS {
+            let (mut work, mut error) = (unknown, unknown * UNSURE * f64::from(self.spread));
+            for worst in 0..CLASSES {
+                work += overhead * demand.points[worst];
+                if self.of[level][worst] >= 1.0 {
+                    work += demand.points[worst];
+                    error += demand.error[worst];
+                    continue;
+                }
+                for class in worst..CLASSES {
+                    let (bins, rate) = (demand.bins[worst][class], self.of[level][class]);
+                    work += SURE * bins * f64::from(rate);
+                    error += bins * f64::from(self.variance[class] * left(rate, self.spread));
+                }
+            }
+            if work * error < least {
+                (least, self.best) = (work * error, level);
+            }
+        }
+    }
+}
+
+/// How a cell would be asked.
+struct Plan {
+    /// Bins of each class.
+    members: [u8; CLASSES],
+    /// The level at which it gets no more than the usual number of samples.
+    level: usize,
+    /// The class of most doubt.
+    worst: usize,
+}
+
+impl Plan {
+    /// The part of the usual number of samples that it gets.
+    fn mean(&self, rates: &Rates, level: usize) -> f32 {
+        let mut sum = 0.0;
+        for (&members, &rate) in self.members.iter().zip(&rates.of[level]) {
+            sum += f32::from(members) * rate;
+        }
+        sum / BINS as f32
+    }
+
+    /// Is there a bin that is worth a usual sample? Then the cell gets as many as it may: a point that is asked at all
+    /// costs about the same for few rays and for many.
+    fn unsure(&self, rates: &Rates, level: usize) -> bool {
+        rates.of[level][self.worst] >= 1.0
+    }
+}
+
+/// What the cells of a map ask for, for [`Rates::choose`]: sums by the class of most doubt in a cell.
+#[derive(Clone, Copy, Debug, PartialEq)]
+pub struct Demand {
+    points: [f64; CLASSES],
+    /// What the usual number of samples would leave, well spread.
+    error: [f64; CLASSES],
+    bins: [[f64; CLASSES]; CLASSES],
+}
+
+impl Default for Demand {
+    fn default() -> Self {
+        Self { points: [0.0; CLASSES], error: [0.0; CLASSES], bins: [[0.0; CLASSES]; CLASSES] }
+    }
+}
+
+impl Demand {
+    /// Adds a cell of which one expects this, and which so many points ask.
+    pub fn add(&mut self, expected: &[f32; BINS], points: f64, rates: &Rates) {
+        let plan = rates.plan(expected);
+        self.points[plan.worst] += points;
+        for (class, &members) in plan.members.iter().enumerate() {
+            let part = points * f64::from(members) / BINS as f64;
+            self.bins[plan.worst][class] += part;
+            let rate = rates.of[plan.level][class];
+            self.error[plan.worst] += part * f64::from(rates.variance[class] * left(rate, rates.spread));
+        }
     }
 }
 
@@ -381,90 +707,48 @@ impl Doubts {
         (measured + few * UNSURE) / (self.asked[class] as f64 + few)
     }
 
-    /// The chances that make the product of work and error least, where `segments` of each class are to come,
-    /// `unknown` ones are asked for sure, and a segment costs `overhead` rays before it is asked. `spread` is what the
-    /// samples' pattern leaves of the variance that bins have by themselves.
-    pub fn chances(&self, segments: &[u64; CLASSES], unknown: u64, overhead: f64, spread: f64) -> Chances {
-        let mut variance = [0.0; CLASSES];
-        let mut base = 0.0;
-        for class in 0..CLASSES {
-            variance[class] = self.variance(class);
-            base += spread * segments[class] as f64 * variance[class];
+    /// The rates to choose from. `spread` is what the usual samples leave of the variance that bins have by themselves.
+    ///
+    /// A bin of variance v gets the rate r at which one more sample would take away as much in any bin: the error is
+    /// `v (1/r - 1 + spread)` up to `r = 1`, and `v spread r^-1.5` beyond.
+    pub fn rates(&self, spread: f32) -> Rates {
+        let mut rates = Rates::each(1.0);
+        for (class, variance) in rates.variance.iter_mut().enumerate() {
+            *variance = self.variance(class) as f32;
         }
-        let mut best = (f64::INFINITY, Chances::ALL);
-        // q = eagerness · sqrt(variance) for eagernesses from 1/4 to 2^13.5, by half powers of 2.
-        let mut eagerness = 0.25;
-        for _ in 0..32 {
-            let (mut work, mut error) = (unknown as f64, base);
-            let mut chances = Chances::ALL;
-            for class in 0..CLASSES {
-                let sixteenths = libm::ceil(16.0 * eagerness * libm::sqrt(variance[class]));
-                chances.0[class] = sixteenths.clamp(1.0, 16.0) as u8;
-                let q = f64::from(chances.0[class]) / 16.0;
-                work += segments[class] as f64 * (q + overhead);
-                error += segments[class] as f64 * variance[class] * (1.0 / q - 1.0);
+        rates.spread = spread;
+        let mut price = 1.0;
+        for of in &mut rates.of {
+            for (rate, variance) in of.iter_mut().zip(rates.variance) {
+                let ratio = variance / price;
+                let wanted = if ratio < 1.0 {
+                    libm::sqrtf(ratio)
+                } else {
+                    libm::powf(1.5 * spread * ratio, 0.4).max(1.0)
+                };
+                *rate = wanted.clamp(LEAST_RATE, MOST_RATE);
             }
-            if work * error < best.0 {
-                best = (work * error, chances);
-            }
-            eagerness *= core::f64::consts::SQRT_2;
+            price *= 0.625;
         }
-        best.1
+        rates
     }
 }
 
-/// The chance to be asked of each class of doubt, in units of 1/16.
-#[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub struct Chances([u8; CLASSES]);
+/// Rates are between these.
+///
+/// Measured: below a half, what is missed in bins that look sure costs more than the rays saved, since rays that meet
+/// nothing near them are cheap.
+const LEAST_RATE: f32 = 0.5;
+const MOST_RATE: f32 = 4.0;
 
-impl Chances {
-    /// Ask everything.
-    pub const ALL: Self = Self([LEAST_CHANCE as u8; CLASSES]);
-
-    /// The same for all classes: `sixteenths` from 1 to 16, or the nearest of these.
-    pub fn each(sixteenths: u8) -> Self {
-        Self([sixteenths.clamp(1, LEAST_CHANCE as u8); CLASSES])
-    }
-
-    /// In units of 1/16: from 1 to 16.
-    #[inline(always)]
-    pub fn of(&self, class: u8) -> u8 {
-        self.0[class as usize & (CLASSES - 1)]
-    }
-}
+/// What a ray costs where there is no doubt: hardly anything is near it.
+const SURE: f64 = 0.35;
 
 /// Rays before a cell has odds.
-const ENOUGH: f32 = 8.0;
+const ENOUGH: f32 = BINS as f32;
 
 /// How many rays the neighbourhood's doubt counts as.
 const DOUBT: f32 = 0.25;
-
-#[inline]
-fn unit(byte: u8) -> f32 {
-    f32::from(byte) * (1.0 / 255.0)
-}
-
-/// Segments of a batch are asked by systematic sampling: with one random number for the batch each has exactly its
-/// chance, and the number of rays is within one of what is expected.
-#[derive(Clone, Copy, Debug)]
-pub struct Coin(u32);
-
-impl Coin {
-    /// From a number uniform in [0, 1).
-    #[inline(always)]
-    pub fn new(uniform: f32) -> Self {
-        Self((uniform * LEAST_CHANCE as f32) as u32)
-    }
-
-    /// Whether the next segment is asked: true with chance `sixteenths / 16`.
-    #[inline(always)]
-    pub fn toss(&mut self, sixteenths: u8) -> bool {
-        self.0 += u32::from(sixteenths);
-        let asked = self.0 >= LEAST_CHANCE;
-        self.0 &= LEAST_CHANCE - 1;
-        asked
-    }
-}
 
 /// What is thought of a segment.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -476,17 +760,10 @@ pub struct Odds {
 }
 
 impl Odds {
-    /// What is thought of a segment that is not asked: u, and 0 where all are asked, when a guess would only add rounding.
+    /// u as a number from 0 to 1.
     #[inline(always)]
-    pub fn guess(self, chances: &Chances) -> f32 {
-        if u32::from(chances.of(self.class)) == LEAST_CHANCE { 0.0 } else { unit(self.u) }
-    }
-
-    /// What a ray adds to the guess: `(V - u)/q`.
-    #[inline(always)]
-    pub fn correction(self, chances: &Chances, free: bool) -> f32 {
-        let visible = if free { 1.0 } else { 0.0 };
-        (visible - self.guess(chances)) * (LEAST_CHANCE as f32 / f32::from(chances.of(self.class)))
+    pub fn guess(self) -> f32 {
+        f32::from(self.u) * (1.0 / 255.0)
     }
 }
 

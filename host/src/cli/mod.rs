@@ -4,6 +4,7 @@ pub mod compare;
 mod compare_methods;
 pub mod generate;
 pub mod info;
+mod learn;
 pub mod map;
 pub mod photons;
 pub mod render;
@@ -39,6 +40,8 @@ enum Command {
     Compare(compare::CompareArgs),
     /// Run methods side by side on a scene, and write a page of their errors and times.
     CompareMethods(compare_methods::CompareMethodsArgs),
+    /// Learn where shadows begin and end, for later renders; or say what such a map holds.
+    Map(learn::LearnArgs),
     /// Show the photons of the occlusion map, and what they say.
     Photons(photons::PhotonsArgs),
     /// Write a scene of any size.
@@ -76,6 +79,7 @@ pub fn run() -> ExitCode {
         Command::Info(args) => info::run(args, level).map(|()| Ended::Done),
         Command::Compare(args) => compare::run(args).map(|()| Ended::Done),
         Command::CompareMethods(args) => compare_methods::run(args, level),
+        Command::Map(args) => learn::run(args, level),
         Command::Photons(args) => photons::run(args, level).map(|()| Ended::Done),
         Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
         Command::Reproduce(args) => reproduce::run(args, level),

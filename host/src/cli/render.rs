@@ -1,12 +1,12 @@
 //! `occlude render`.
 
 use super::map::{self, MapArgs};
-use super::{Ended, note};
+use super::{Ended, learn, note};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, Form, Map, MapOptions, MapTerms, Rule, Settings, Split, Stage, Stochastic,
-    Visibility, Walled,
+    Auto, AutoOptions, Exact, Form, Map, MapOptions, MapTerms, Rule, SavedMap, Settings, Split, Stage,
+    Stochastic, Visibility, Walled,
 };
 use crate::photons::BlockerKind;
 use crate::render::{Limits, render, render_adaptively};
@@ -94,6 +94,9 @@ pub struct RenderArgs {
     quiet: bool,
 
     #[command(flatten)]
+    auto: AutoArgs,
+
+    #[command(flatten)]
     stochastic: StochasticArgs,
 
     #[command(flatten)]
@@ -101,6 +104,27 @@ pub struct RenderArgs {
 
     #[command(flatten)]
     camera: CameraArgs,
+}
+
+/// The options of `--method auto`.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "With --method auto")]
+struct AutoArgs {
+    /// Begin with what was learned before: a map that `occlude map SCENE -o FILE` wrote.
+    #[arg(long = "map", value_name = "FILE")]
+    file: Option<PathBuf>,
+
+    /// Bytes that the map may take, like 64M [default: 256M].
+    #[arg(long, value_name = "BYTES", value_parser = learn::memory)]
+    map_memory: Option<usize>,
+}
+
+impl AutoArgs {
+    /// The first option that was given.
+    fn given(&self) -> Option<&'static str> {
+        let given = [(self.file.is_some(), "--map"), (self.map_memory.is_some(), "--map-memory")];
+        given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
+    }
 }
 
 /// The options of `--method stochastic`.
@@ -272,6 +296,9 @@ impl Chosen {
         if let (true, Some(option)) = (args.method != Method::Stochastic, args.stochastic.given()) {
             return Err(Error::Usage(format!("{option} is an option of --method stochastic")));
         }
+        if let (true, Some(option)) = (args.method != Method::Auto, args.auto.given()) {
+            return Err(Error::Usage(format!("{option} is an option of --method auto")));
+        }
         let (mapped, blockers) = (args.map.given(), args.map.names_blockers().then_some("--blockers"));
         if let (Method::Exact | Method::Auto, Some(option)) = (args.method, mapped.or(blockers)) {
             return Err(Error::Usage(format!(
@@ -294,7 +321,7 @@ impl Chosen {
                 }
             },
             Method::Map => Self::Map(args.map.options(args.quality)?),
-            Method::Auto => Self::Auto(AutoOptions::default()),
+            Method::Auto => Self::Auto(learn::options(args.auto.map_memory)),
         })
     }
 
@@ -345,6 +372,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         output::check_writable_bytes(path)?;
     }
     let reference = args.reference.as_ref().map(output::read).transpose()?;
+    let learned = args.auto.file.as_ref().map(SavedMap::read).transpose()?;
 
     let start = Instant::now();
     let scene = scene::load(&args.scene, &args.camera.request())?;
@@ -395,7 +423,15 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     match &chosen {
         Chosen::Exact => {}
         Chosen::Stochastic(settings) => stochastic = Some(Stochastic::new(*settings, &scene, &stage.bvh)?),
-        Chosen::Auto(options) => auto = Some(Auto::new(*options)),
+        Chosen::Auto(options) => {
+            auto = Some(match (learned, &args.auto.file) {
+                (Some(learned), Some(path)) => {
+                    learned.check(path, &stage)?;
+                    Auto::with_saved(*options, learned)
+                }
+                _ => Auto::new(*options),
+            });
+        }
         Chosen::MapTerms(_, options) | Chosen::Map(options) => {
             prepared = Some(map::prepare(&stage, options, args.threads.into())?)
         }

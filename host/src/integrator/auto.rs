@@ -1,19 +1,30 @@
 //! The occlusion map that learns: rays go where shadows begin and end, and the picture is right on average.
 //!
-//! Before the first pass, camera rays say which cells the picture needs ([`occlude_kernel::occlusion_map`]); a shaft
-//! proves some of them lit; photons shot from the lights through everything give the others their first odds. Each pass
-//! is rendered against the map as it is. What its rays saw is counted, in whole numbers, so that no order of threads
-//! matters, and between passes the counts become new odds.
+//! Before the first pass, some camera rays say which cells the picture needs ([`occlude_kernel::occlusion_map`]), and a
+//! shaft proves some of them lit. Each pass is rendered against the map as it is. What its rays saw is counted, in
+//! whole numbers, so that no order of threads matters, and between passes the counts become new odds.
+//!
+//! With odds, shadow rays go to the lights, and to the parts of a light, where there is doubt; no point gets more of them
+//! than it would without a map, on average. Cells in which that does not help are rendered as by the exact method, and
+//! when all are such, so is the whole picture: then the map sleeps, and costs nothing any more.
 
-use super::{CameraSample, Fan, Questions, Scratch, Share, Stage, Visibility, cast, divide, exact};
+mod saved;
+
+pub use saved::{SavedMap, fingerprint};
+
+use self::saved::SavedCell;
+use super::{
+    CameraSample, Fan, NOBODY, Open, Questions, Scratch, ShadingPoint, Stage, Visibility, cast, exact,
+    expect, round, sample_lights,
+};
 use crate::film::Tile;
-use crate::light::AreaLight;
+use crate::light::{AreaLight, Shape};
 use crate::photons::{BlockerSet, Shower};
 use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::occlusion_map::{
-    BINS, CLASSES, CellKey, Chances, Coin, Doubts, Known, MapCell, OcclusionMap, Tally, bin, class,
+    BIN_EDGE, BINS, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally, bin,
 };
 use occlude_kernel::{Bvh, Counts, Hit, Ray, Simd, Targets, TileScratch, Uncounted, offset};
 use rayon::prelude::*;
@@ -27,7 +38,7 @@ use std::sync::{Mutex, RwLock};
 pub struct AutoOptions {
     /// Pixels across a cell, at least: cells have edges of one to two times that many.
     pub cell: f32,
-    /// Photons to shoot before the first pass; from the number of cells if not given.
+    /// Photons to shoot before the first pass; if not given, some where a point has few shadow rays, and else none.
     pub photons: Option<u64>,
     /// Bytes that cells may take.
     pub memory: usize,
@@ -51,6 +62,38 @@ pub struct Auto {
     strays: Mutex<Vec<Stray>>,
     /// How far this pass' guesses are off.
     doubts: Mutex<Doubts>,
+    /// What was learned before.
+    before: Option<SavedMap>,
+    /// Whether it goes on learning where it is no help.
+    restless: bool,
+}
+
+/// What the map knew after a pass, by the points that ask it.
+#[derive(Clone, Copy, Debug)]
+pub struct Learned {
+    /// Passes so far.
+    pub passes: u32,
+    /// Cells.
+    pub cells: usize,
+    /// The part of all points of a light that is proven lit.
+    pub lit: f64,
+    /// That has odds.
+    pub odds: f64,
+    /// That is left to the exact method for good.
+    pub left_alone: f64,
+    /// Where there are odds, the part of the usual samples that is asked for,
+    pub part: f64,
+    /// and the mean variance of V - u, by bins.
+    pub doubt: f64,
+    /// How many times better than the exact method visibility is thought to be, at equal error.
+    pub promise: f64,
+    /// Whether the map helps so little that it is not asked any more.
+    pub asleep: bool,
+}
+
+fn points_of(map: &Map, which: impl Fn(&MapCell) -> bool) -> f64 {
+    let counts = |(cell, &points): (&MapCell, &u32)| if which(cell) { f64::from(points) } else { 0.0 };
+    map.cells.iter().zip(&map.points).map(counts).sum()
 }
 
 #[derive(Clone, Copy, Debug)]
@@ -84,7 +127,13 @@ struct Map {
     /// How far guesses were off.
     doubts: Doubts,
     /// And what follows from that.
-    chances: Chances,
+    rates: Rates,
+    /// How much better than the exact method it is thought to be.
+    promise: f64,
+    /// Is it no help at all?
+    asleep: bool,
+    /// Samples of a light that a point sees, on average.
+    samples: f64,
     passes: u32,
     /// Strays that a tile may report, so that they take no more memory than the cells may.
     most_strays: usize,
@@ -92,6 +141,8 @@ struct Map {
     ray: f64,
     /// Is there room for no more cells?
     full: bool,
+    /// What was known after each lesson.
+    history: Vec<Learned>,
 }
 
 impl Default for Map {
@@ -105,11 +156,15 @@ impl Default for Map {
             before: Vec::new(),
             angle: 0.0,
             doubts: Doubts::default(),
-            chances: Chances::ALL,
+            rates: Rates::each(1.0),
+            promise: 1.0,
+            asleep: false,
+            samples: 0.0,
             passes: 0,
             most_strays: 0,
             ray: 4.0,
             full: false,
+            history: Vec::new(),
         }
     }
 }
@@ -117,16 +172,19 @@ impl Default for Map {
 /// How often a cell is tried to be proven lit, at most.
 const TRIES: u8 = 4;
 
-/// What it costs to think of a sample, and of one that then gets a ray; ns.
-const SKIPPED: f64 = 3.0;
-const CHOSEN: f64 = 5.0;
+/// What it costs to look a point up, and to think of a light there, ns; and of each sample.
+const CONSIDERED: f64 = 250.0;
+const SAMPLED: f64 = 5.0;
 
-/// How much more a ray costs whose neighbours were not chosen.
-const SCATTERED: f64 = 1.3;
+/// What it costs more to draw a sample from a cell's density, and to take what is known from it.
+const DRAWN: f64 = 3.0;
 
-/// What well spread samples leave of the variance that bins have by themselves: a border crosses few of a point's bins,
-/// but many of a cell's. Measured: at 0.06 the error of pictures is that of asking every ray, or a little less.
-const SPREAD: f64 = 0.06;
+/// What well spread samples leave of the variance that bins have by themselves, times the root of their number: a border
+/// crosses few of a point's bins, but many of a cell's.
+const SPREAD: f64 = 0.5;
+
+/// With fewer samples of a light than this, what each point of a light sends is not worth a closer look.
+const FEW: u32 = 8;
 
 /// Photons for each cell.
 const PHOTONS: u64 = 4;
@@ -153,6 +211,26 @@ impl Map {
 
     fn count(&self, place: usize, free: bool) {
         self.tallies[place].fetch_add(1 << 32 | u64::from(free), Ordering::Relaxed);
+    }
+
+    /// Takes in what was learned before, as far as there is room.
+    fn remember(&mut self, saved: &SavedMap, options: &AutoOptions) {
+        let room = options.memory / CELL_BYTES;
+        self.full = saved.cells.len() > room;
+        for SavedCell { cell, points, tallies } in saved.cells.iter().take(room) {
+            self.cells.push(*cell);
+            self.points.push(*points);
+            self.tries.push(TRIES);
+            let words = tallies.iter().map(|tally| u64::from(tally.asked) << 32 | u64::from(tally.free));
+            self.tallies.extend(words.map(AtomicU64::new));
+        }
+        for cell in &mut self.cells {
+            cell.forget();
+        }
+        self.passes = saved.passes;
+        self.doubts = saved.doubts;
+        self.table.resize(OcclusionMap::table(self.cells.len()), OcclusionMap::FREE);
+        OcclusionMap::index(&self.cells, &mut self.table);
     }
 
     /// Makes room for points that have none.
@@ -184,7 +262,7 @@ impl Map {
             }
             group.iter().for_each(|stray| cell.add(stray.origin));
             let size = group[0].origin.distance(stage.eye) * self.angle;
-            cell.widen(if index < known { 0.5 * size } else { size }, 0.25 * clearance);
+            cell.widen(if index < known { 0.5 * size } else { 2.0 * size }, 0.25 * clearance);
             self.points[index] += group.len() as u32;
         }
         self.tallies.resize_with(self.cells.len() * BINS, AtomicU64::default);
@@ -208,7 +286,7 @@ impl Map {
                     return;
                 }
                 *tries -= 1;
-                let light = &stage.lights[cell.key().light() as usize];
+                let Some(light) = stage.lights.get(cell.key().light() as usize) else { return };
                 let corners = cell.corners();
                 let lit = dispatch(stage.level, Prove { bvh: stage.bvh, light, corners: &corners, scratch });
                 if lit {
@@ -235,26 +313,76 @@ impl Map {
             .with_min_len(256)
             .map(|index| if this.cells[index].is_lit() { None } else { MapCell::expect(&this.tally(index)) })
             .collect();
-        // How many bins of which class, weighed by how often they are asked.
-        let mut segments = [0u64; CLASSES];
-        let mut unknown = 0;
+        let spread = (SPREAD / self.samples.max(1.0).sqrt()).min(1.0);
+        self.rates = self.doubts.rates(spread as f32);
+        // What is asked for, weighed by how often cells are asked.
+        let mut demand = Demand::default();
+        let mut unknown = 0.0;
         for ((cell, expected), &points) in self.cells.iter().zip(&expected).zip(&self.points) {
             match expected {
                 None if cell.is_lit() => {}
-                None => unknown += BINS as u64 * u64::from(points),
-                Some(expected) => expected.iter().for_each(|&p| segments[class(p)] += u64::from(points)),
+                None => unknown += f64::from(points),
+                Some(expected) => demand.add(expected, f64::from(points), &self.rates),
             }
         }
-        // What a ray costs when all are asked, and what one costs that was chosen; ns.
-        let ray = self.ray;
-        let chosen = SCATTERED * ray + CHOSEN;
-        self.chances = self.doubts.chances(&segments, unknown, SKIPPED / chosen, SPREAD);
+        let overhead = CONSIDERED / (self.samples * (self.ray + SAMPLED));
+        self.rates.choose(&demand, unknown, overhead);
         self.doubts.fade();
-        let most =
-            if self.passes >= FOR_GOOD { ((ray - SKIPPED) / chosen).clamp(0.0, 1.0) as f32 } else { 1.0 };
-        let chances = self.chances;
+        let rates = self.rates;
         let cells = self.cells.par_iter_mut().zip(&expected).with_min_len(256);
-        cells.for_each(|(cell, expected)| cell.learn(expected.as_ref(), &chances, most));
+        cells.for_each(|(cell, expected)| cell.learn(expected.as_ref(), &rates));
+        self.weigh();
+    }
+
+    /// Leaves alone what the exact method does better.
+    fn weigh(&mut self) {
+        let (samples, ray) = (self.samples, self.ray);
+        let exact_time = samples * (ray + SAMPLED);
+        let (mut time, mut error) = (0.0, 0.0);
+        let (mut odds, mut part, mut doubt) = (0.0, 0.0, 0.0);
+        let (mut all, mut exact_error, mut decided) = (0.0, 0.0, 0.0);
+        for (cell, &points) in self.cells.iter_mut().zip(&self.points) {
+            let points = f64::from(points);
+            all += points;
+            if cell.is_lit() {
+                decided += points;
+                continue;
+            }
+            let [left, usual] = cell.errors().map(f64::from);
+            exact_error += points * usual;
+            if cell.is_known() {
+                decided += points;
+                let known_time = CONSIDERED + (exact_time + samples * DRAWN) * f64::from(cell.part());
+                let hopeless = known_time * left > HOPELESS * exact_time * usual;
+                if !(self.passes >= FOR_GOOD && hopeless && cell.part() > 0.8) {
+                    time += points * known_time;
+                    error += points * left;
+                    odds += points;
+                    part += points * f64::from(cell.part());
+                    doubt += points * usual / f64::from(self.rates.spread());
+                    continue;
+                }
+                cell.set_all();
+            }
+            time += points * exact_time;
+            error += points * usual;
+        }
+        self.promise = all * exact_time * exact_error / (time * error).max(f64::MIN_POSITIVE);
+        if self.passes >= FOR_GOOD && self.promise < AWAKE && (decided > 0.5 * all || self.passes >= PATIENCE)
+        {
+            self.asleep = true;
+        }
+        self.history.push(Learned {
+            passes: self.passes,
+            cells: self.cells.len(),
+            lit: points_of(self, |cell| cell.is_lit()) / all.max(1.0),
+            left_alone: points_of(self, |cell| cell.known([f32::NAN; 3]) == Known::All) / all.max(1.0),
+            odds: odds / all.max(1.0),
+            part: part / odds.max(1.0),
+            doubt: doubt / odds.max(1.0),
+            promise: self.promise,
+            asleep: self.asleep,
+        });
     }
 
     /// About what a shadow ray costs where not all is lit, ns: from the tests of some rays and not from a clock, so that
@@ -281,23 +409,137 @@ impl Map {
 /// Rays to see what rays cost.
 const PROBES: usize = 4096;
 
-/// Passes before cells that are all doubt are left alone.
-const FOR_GOOD: u32 = 3;
+/// Is it counted what a point's rays see? Always at first, and later of every second and of every fourth one: where rays
+/// are cheap, counting costs as much as they do.
+fn heard(point: u32, passes: u32) -> bool {
+    let every = [1, 1, 1, 2, 2, 2, 2, 2].get(passes as usize).copied().unwrap_or(4);
+    point.wrapping_add(passes).is_multiple_of(every)
+}
 
-/// Writes which samples are asked, and gives what is known of all of them together.
-fn choose(cell: &MapCell, chances: &Chances, fan: &Fan, coin: &mut Coin, some: &mut Vec<u32>) -> f32 {
-    let count = fan.weights.len();
-    some.resize(count, 0);
-    let (weights, bins, some_of) = (&fan.weights[..count], &fan.bins[..count], &mut some[..count]);
-    let (mut kept, mut sum) = (0, 0.0);
-    for i in 0..count {
-        let odds = cell.odds(usize::from(bins[i]) % BINS);
-        sum += odds.guess(chances) * weights[i];
-        some_of[kept] = i as u32;
-        kept += usize::from(coin.toss(chances.of(odds.class)) & (weights[i] > 0.0));
+/// Passes before guesses are put to use: in the first there are none, and the second shows how far they are off.
+const TRIAL: u32 = 2;
+
+/// Passes before cells that are all doubt are left alone.
+const FOR_GOOD: u32 = 2;
+
+/// Passes before the map sleeps though it has seen too little to tell.
+const PATIENCE: u32 = 8;
+
+/// A cell is left alone if its product of work and squared error is thought to be more than this part of the exact
+/// method's.
+const HOPELESS: f64 = 0.9;
+
+/// And the whole picture if the map is thought to be no more than this many times better.
+const AWAKE: f64 = 1.05;
+
+/// Corners of the bins of a light.
+const CORNER_EDGE: usize = BIN_EDGE + 1;
+
+/// What the corners of the bins would send to a point if they were the whole light.
+#[inline(always)]
+fn corners(area: &AreaLight, point: &ShadingPoint) -> [f32; CORNER_EDGE * CORNER_EDGE] {
+    let whole = area.shape == Shape::Parallelogram;
+    let scale = area.area * FRAC_1_PI;
+    let mut grid = [0.0; CORNER_EDGE * CORNER_EDGE];
+    let mut column = 0;
+    while column < CORNER_EDGE {
+        let s = column as f32 / BIN_EDGE as f32;
+        let (start, step) = if whole {
+            (area.corner + area.u * s, area.v)
+        } else {
+            let root = s.sqrt();
+            (area.corner + area.u * (1.0 - root), area.v * root)
+        };
+        let (from, step) = (start - point.x, step * (1.0 / BIN_EDGE as f32));
+        let mut row = 0;
+        while row < CORNER_EDGE {
+            let path = from + step * row as f32;
+            let squared = path.length_squared();
+            let (leaving, arriving) = (-area.normal.dot(path), point.normal.dot(path));
+            let arrives = leaving > 0.0 && arriving > 0.0;
+            let weight = leaving / squared * (arriving / squared) * scale;
+            grid[row * CORNER_EDGE + column] = if arrives { weight } else { 0.0 };
+            row += 1;
+        }
+        column += 1;
     }
-    some.truncate(kept);
-    sum
+    grid
+}
+
+/// Samples of a light that follow a cell's density.
+struct Draws<'a> {
+    cell: &'a MapCell,
+    fan: &'a mut Fan,
+    /// Whether to look at what the corners of the bins would send; or else all send the same.
+    closely: bool,
+    /// What all of the light would send.
+    whole: f32,
+    area: &'a AreaLight,
+    point: &'a ShadingPoint,
+    square: &'a mut [[f32; 2]],
+    each: f32,
+    clearance: f32,
+}
+
+impl Task for Draws<'_> {
+    /// What is known of the whole light, and what the samples have of it.
+    type Output = [f32; 2];
+
+    #[inline(always)]
+    fn run<S: Simd>(self, simd: S) -> [f32; 2] {
+        let Self { cell, fan, closely, whole, area, point, square, each, clearance } = self;
+        let count = square.len();
+        let mut i = 0;
+        while i < count {
+            let drawn = cell.draw(square[i]);
+            square[i] = drawn.at;
+            fan.densities[i] = drawn.density;
+            i += 1;
+        }
+        Open { fan: &mut *fan, area, point, square: &*square, each, clearance }.run(simd);
+        let (weights, bins, densities) =
+            (&mut fan.weights[..count], &fan.bins[..count], &fan.densities[..count]);
+        let (mut known, mut had) = (0.0, 0.0);
+        if closely {
+            let grid = corners(area, point);
+            let mut bin = 0;
+            while bin < BINS {
+                let at = bin / BIN_EDGE * CORNER_EDGE + bin % BIN_EDGE;
+                let four = grid[at] + grid[at + 1] + grid[at + CORNER_EDGE] + grid[at + CORNER_EDGE + 1];
+                known += cell.odds(bin).guess() * four;
+                bin += 1;
+            }
+            known *= 0.25 / BINS as f32;
+            i = 0;
+            while i < count {
+                let bin = usize::from(bins[i]) & (BINS - 1);
+                let (row, column) = (bin / BIN_EDGE, bin % BIN_EDGE);
+                let at = row * CORNER_EDGE + column;
+                let x = square[i][0] * BIN_EDGE as f32 - column as f32;
+                let y = square[i][1] * BIN_EDGE as f32 - row as f32;
+                let above = grid[at] + (grid[at + 1] - grid[at]) * x;
+                let below =
+                    grid[at + CORNER_EDGE] + (grid[at + CORNER_EDGE + 1] - grid[at + CORNER_EDGE]) * x;
+                let sends = above + (below - above) * y;
+                let one = 1.0 / densities[i];
+                had += cell.odds(bin).guess() * sends * one;
+                weights[i] *= one;
+                i += 1;
+            }
+            had *= each;
+        } else {
+            known = cell.mean() * whole;
+            i = 0;
+            while i < count {
+                let one = 1.0 / densities[i];
+                had += cell.odds(usize::from(bins[i]) & (BINS - 1)).guess() * one;
+                weights[i] *= one;
+                i += 1;
+            }
+            had *= each * whole;
+        }
+        [known, had]
+    }
 }
 
 /// Is there nothing between a cell and its light?
@@ -340,17 +582,91 @@ impl Auto {
         Self { options, ..Self::default() }
     }
 
+    /// With what was learned before. Whatever that is, even of another scene, pictures stay right on average; but it only
+    /// helps with the same triangles and lights, and a camera near the same place: [`SavedMap::check`].
+    pub fn with_saved(options: AutoOptions, saved: SavedMap) -> Self {
+        Self { options, before: Some(saved), ..Self::default() }
+    }
+
+    /// One that never falls asleep, to learn for others.
+    pub fn restless(self) -> Self {
+        Self { restless: true, ..self }
+    }
+
+    /// What has been learned so far.
+    pub fn save(&self, stage: &Stage<'_>) -> SavedMap {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let cells = map.cells.iter().zip(&map.points).enumerate();
+        SavedMap {
+            belongs_to: fingerprint(stage),
+            passes: map.passes,
+            shadow_rays: stage.shadow_rays,
+            doubts: map.doubts,
+            cells: cells
+                .map(|(index, (&cell, &points))| SavedCell { cell, points, tallies: map.tally(index) })
+                .collect(),
+        }
+    }
+
+    /// What the map knew after each lesson.
+    pub fn history(&self) -> Vec<Learned> {
+        self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner()).history.clone()
+    }
+
+    /// Bytes that the map takes.
+    pub fn bytes(&self) -> usize {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        map.cells.len() * CELL_BYTES + map.table.len() * size_of::<u32>()
+    }
+
+    /// What is known of the light that the first camera sample of each pixel of a tile might get: the part that is
+    /// proven lit, the part of the usual samples that is asked for, and how much of it the exact method is left with.
+    pub fn survey(&self, stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) -> Vec<[f32; 3]> {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        let view = map.view();
+        scratch.paths.clear();
+        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: 0 }));
+        cast(&Stage { count: false, ..*stage }, tile, width, scratch);
+        let mut seen = vec![[f32::NAN; 3]; tile.len()];
+        for point in &scratch.questions.points {
+            let (mut sums, mut total) = ([0.0; 3], 0.0f32);
+            for (light, area) in (0..).zip(stage.lights) {
+                let Some(unshadowed) = area.unshadowed(point.x, point.normal) else { continue };
+                let key = map.key(&self.options, stage.eye, point.x, point.normal, light);
+                let cell = key.and_then(|key| view.find(key)).map(|cell| &view.cells()[cell]);
+                let value = unshadowed * area.radiance.element_sum();
+                total += value;
+                let [lit, part, left] = match cell.map(|cell| (cell, cell.known(point.origin))) {
+                    Some((_, Known::Lit)) => [1.0, 0.0, 0.0],
+                    Some((cell, Known::Odds)) if !map.asleep => [0.0, cell.part(), 0.0],
+                    _ => [0.0, 1.0, 1.0],
+                };
+                for (sum, add) in sums.iter_mut().zip([lit, part, left]) {
+                    *sum += value * add;
+                }
+            }
+            if total > 0.0 {
+                seen[point.pixel as usize] = sums.map(|sum| sum / total);
+            }
+        }
+        seen
+    }
+
     /// Lets somebody change what the map thinks, between passes. Whatever it thinks, pictures stay right on average, as
     /// long as no cell is called lit that is not.
-    pub fn alter(&self, change: impl FnOnce(&mut [MapCell], &mut Chances)) {
+    pub fn alter(&self, change: impl FnOnce(&mut [MapCell])) {
         let mut map = self.map.write().unwrap_or_else(|poisoned| poisoned.into_inner());
-        let Map { cells, chances, .. } = &mut *map;
-        change(cells, chances);
+        change(&mut map.cells);
     }
 
     /// Shoots photons at the cells, and counts which of them light reaches.
     fn seed(&self, map: &Map, stage: &Stage<'_>) {
-        let lines = self.options.photons.unwrap_or((PHOTONS * map.cells.len() as u64).min(4_000_000));
+        let few = f64::from(stage.shadow_rays) < PHOTONS_BELOW;
+        let some = if few { (PHOTONS * map.cells.len() as u64).min(4_000_000) } else { 0 };
+        let lines = self.options.photons.unwrap_or(some);
+        if lines == 0 {
+            return;
+        }
         let blockers = BlockerSet::Triangles;
         let shower = Shower {
             bvh: stage.bvh,
@@ -373,6 +689,9 @@ impl Auto {
         });
     }
 }
+
+/// With so many shadow rays, a pass tells more than photons would.
+const PHOTONS_BELOW: f64 = 8.0;
 
 /// Photons that a task shoots.
 const CHUNK: u64 = 1024;
@@ -424,19 +743,27 @@ impl Visibility for Auto {
         let beside = stage.camera.ray_direction(0.5 * width as f32 + 1.0, 0.5 * width as f32);
         let most_strays = self.options.memory / size_of::<Stray>() / tiles.len().max(1);
         *map = Map { angle: (beside - ahead).length() / ahead.length(), most_strays, ..Map::default() };
+        if let Some(before) = &self.before {
+            map.remember(before, &self.options);
+        }
         let found = &*map;
-        let strays: Vec<Vec<Stray>> = tiles
+        // A look at every other pixel of every other row finds nearly all cells there are.
+        let looks: Vec<(Vec<Stray>, usize)> = tiles
             .par_iter()
             .map_init(Scratch::default, |scratch, &tile| {
                 scratch.paths.clear();
-                let all = 0..tile.len() as u32;
-                scratch.paths.extend(all.map(|pixel| CameraSample { pixel, index: 0 }));
+                let some = (0..tile.len() as u32).filter(|&pixel| {
+                    let (x, y) = tile.position(pixel as usize);
+                    x % 2 == 0 && y % 2 == 0
+                });
+                scratch.paths.extend(some.map(|pixel| CameraSample { pixel, index: 0 }));
                 cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
+                    let key = found.key(&self.options, stage.eye, point.x, point.normal, 0);
                     for (light, area) in (0..).zip(stage.lights) {
                         if area.unshadowed(point.x, point.normal).is_some() {
-                            let key = found.key(&self.options, stage.eye, point.x, point.normal, light);
+                            let key = key.and_then(|key| key.with_light(light));
                             strays.extend(key.map(|key| Stray {
                                 key,
                                 origin: point.origin,
@@ -446,101 +773,127 @@ impl Visibility for Auto {
                     }
                 }
                 strays.truncate(most_strays);
-                strays
+                (strays, scratch.questions.points.len())
             })
             .collect();
-        let strays = strays.concat();
+        let points: usize = looks.iter().map(|look| look.1).sum();
+        let strays: Vec<Stray> = looks.into_iter().flat_map(|look| look.0).collect();
+        map.samples = f64::from(stage.shadow_rays) * points as f64 / strays.len().max(1) as f64;
         map.take_in(strays.clone(), stage, &self.options);
         self.seed(&map, stage);
         map.prove(stage);
         map.probe(&strays, stage);
         map.learn();
+        map.asleep &= !self.restless;
     }
 
     fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if map.asleep {
+            return sample_lights(stage, scratch);
+        }
         let view = map.view();
         let Scratch { samplers, questions, shares, square, fan, radiance, .. } = scratch;
         let mut strays = Vec::new();
-        let some = &mut Vec::new();
+        // Neighbours are in the same cells.
+        let mut last = None;
+        let mut found: Vec<Option<Option<usize>>> = vec![None; stage.lights.len()];
+        let mut known: Vec<(Known, Option<usize>)> = Vec::new();
         for index in 0..questions.points.len() {
             let point = questions.points[index];
             let sampler = &mut samplers[point.path as usize];
-            divide(stage, &point, sampler, shares);
-            for &Share { light, unshadowed, count, each } in shares.iter() {
-                let area = &stage.lights[light as usize];
-                let key = map.key(&self.options, stage.eye, point.x, point.normal, light);
-                let cell = key.and_then(|key| view.find(key));
-                let known = match cell {
-                    Some(cell) => view.cells()[cell].known(point.origin),
+            expect(stage, &point, shares);
+            let place = map.key(&self.options, stage.eye, point.x, point.normal, 0);
+            if place != last {
+                last = place;
+                found.fill(None);
+            }
+            known.clear();
+            let mut informed = false;
+            for share in shares.iter_mut() {
+                let light = share.light;
+                let key = || place.and_then(|key| key.with_light(light));
+                let cell = *found[light as usize].get_or_insert_with(|| key().and_then(|key| view.find(key)));
+                let thought = match cell.map(|cell| view.cells()[cell].known(point.origin)) {
+                    Some(Known::Odds) if map.passes < TRIAL => Known::Nothing,
+                    Some(thought) => thought,
                     None => Known::Nothing,
                 };
-                let full = point.diffuse * area.radiance;
-                if known == Known::Lit {
-                    radiance[point.path as usize] += full * (unshadowed * FRAC_1_PI);
+                known.push((thought, cell));
+                if thought == Known::Lit {
+                    share.expected = 0.0;
+                    informed = true;
                     continue;
                 }
                 let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
-                let wanted = outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays;
-                if let (Some(key), true) = (key, wanted) {
-                    strays.push(Stray { key, origin: point.origin, normal: point.normal });
+                if outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays {
+                    strays.extend(key().map(|key| Stray { key, origin: point.origin, normal: point.normal }));
                 }
-                if count == 0 {
+                if let (Known::Odds, Some(cell)) = (thought, cell) {
+                    share.expected *= view.cells()[cell].part();
+                    informed = true;
+                }
+            }
+            round(stage, sampler, shares, !informed);
+            for (share, &(thought, cell)) in shares.iter().zip(&known) {
+                let area = &stage.lights[share.light as usize];
+                let full = point.diffuse * area.radiance;
+                let whole = share.unshadowed * FRAC_1_PI;
+                if thought == Known::Lit {
+                    radiance[point.path as usize] += full * whole;
                     continue;
                 }
-                let share = count as f32 * each;
+                let odds = cell.filter(|_| thought == Known::Odds).map(|cell| &view.cells()[cell]);
+                let cell = cell.filter(|_| thought != Known::All && heard(index as u32, map.passes));
+                if share.count == 0 {
+                    if let Some(cell) = odds {
+                        radiance[point.path as usize] += full * (cell.mean() * whole);
+                    }
+                    continue;
+                }
                 let first = questions.weights.len() as u32;
                 square.clear();
-                sampler.points(stage.pattern, count as usize, square);
-                let mut coin = Coin::new(sampler.uniform());
-                some.clear();
-                let sum = match (known, cell) {
-                    (Known::Flat(odds), Some(_)) => {
-                        // Only those that are asked need be there; the others add up to what is known.
-                        let chance = map.chances.of(odds.class);
-                        square.retain(|_| coin.toss(chance));
-                        fan.open(stage, area, &point, square, each);
-                        some.extend((0..).zip(&fan.weights).filter(|(_, w)| **w > 0.0).map(|(i, _)| i));
-                        odds.guess(&map.chances) * unshadowed * FRAC_1_PI * share
+                sampler.points(stage.pattern, share.count as usize, square);
+                match odds {
+                    Some(cell) if cell.is_flat() => {
+                        fan.open(stage, area, &point, square, share.each);
+                        let had: f32 = fan.weights.iter().sum();
+                        radiance[point.path as usize] += full * (cell.mean() * (whole - had));
                     }
-                    (Known::Bins, Some(index)) => {
-                        fan.open(stage, area, &point, square, each);
-                        choose(&view.cells()[index], &map.chances, fan, &mut coin, some)
+                    Some(cell) => {
+                        let closely = share.expected >= FEW as f32;
+                        fan.resize(square.len());
+                        let [sum, had] = dispatch(
+                            stage.level,
+                            Draws {
+                                cell,
+                                fan,
+                                closely,
+                                whole,
+                                area,
+                                point: &point,
+                                square,
+                                each: share.each,
+                                clearance: stage.bvh.clearance(),
+                            },
+                        );
+                        radiance[point.path as usize] += full * (sum - had);
                     }
-                    _ => {
-                        fan.open(stage, area, &point, square, each);
-                        0.0
-                    }
-                };
-                let known_bins = matches!(known, Known::Flat(_) | Known::Bins);
-                match cell {
-                    Some(index) if known != Known::All => {
-                        if !known_bins {
-                            some.extend((0..).zip(&fan.weights).filter(|(_, w)| **w > 0.0).map(|(i, _)| i));
-                        }
-                        fan.append_some_to(some, questions);
-                        let cell = &view.cells()[index];
-                        let odds = |bin: u8| match known {
-                            Known::Flat(odds) => Some(odds),
-                            Known::Bins => Some(cell.odds(usize::from(bin))),
-                            _ => None,
-                        };
-                        let bins = || some.iter().map(|&i| fan.bins[i as usize]);
-                        questions.odds.extend(bins().map(odds));
-                        questions.places.extend(bins().map(|bin| (index * BINS) as u32 + u32::from(bin)));
-                    }
-                    _ => fan.append_to(questions),
+                    None => fan.open(stage, area, &point, square, share.each),
                 }
-                questions.odds.resize(questions.weights.len(), None);
-                questions.places.resize(questions.weights.len(), u32::MAX);
-                radiance[point.path as usize] += full * sum;
+                fan.append_to(questions);
                 let last = questions.weights.len() as u32;
                 if last > first {
+                    match cell {
+                        Some(_) => fan.append_bins_to(&mut questions.bins),
+                        None => questions.bins.resize(last as usize, 0),
+                    }
+                    questions.cells.push(cell.map_or(NOBODY, |cell| cell as u32));
                     questions.batches.push(super::Batch {
                         point: index as u32,
-                        light,
+                        light: share.light,
                         samples: first..last,
-                        share,
+                        share: share.count as f32 * share.each,
                     });
                 }
             }
@@ -557,29 +910,31 @@ impl Visibility for Auto {
         estimates: &mut Vec<f32>,
         counts: &mut Counts,
     ) {
+        exact::trace(stage, &[], questions, estimates, counts);
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
-        let blocked = exact::blocked(stage, &[], questions, counts);
-        estimates.clear();
         let mut doubts = Doubts::default();
-        for (i, (odds, &place)) in questions.odds.iter().zip(&questions.places).enumerate() {
-            let free = blocked[i / 64] >> (i % 64) & 1 == 0;
-            estimates.push(match odds {
-                Some(odds) => {
-                    doubts.count(*odds, free);
-                    odds.correction(&map.chances, free)
+        for (batch, &index) in questions.batches.iter().zip(&questions.cells) {
+            let Some(cell) = map.cells.get(index as usize) else { continue };
+            let first = index as usize * BINS;
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            for (&bin, &estimate) in questions.bins[samples.clone()].iter().zip(&estimates[samples]) {
+                let (bin, free) = (usize::from(bin) % BINS, estimate > 0.0);
+                map.count(first + bin, free);
+                if cell.is_known() {
+                    doubts.count(cell.odds(bin), free);
                 }
-                None if free => 1.0,
-                None => 0.0,
-            });
-            if place != u32::MAX {
-                map.count(place as usize, free);
             }
         }
-        self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
+        if doubts != Doubts::default() {
+            self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
+        }
     }
 
     fn passed(&self, stage: &Stage<'_>) {
         let mut map = self.map.write().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if map.asleep {
+            return;
+        }
         let strays =
             std::mem::take(&mut *self.strays.lock().unwrap_or_else(|poisoned| poisoned.into_inner()));
         if !strays.is_empty() {
@@ -592,6 +947,7 @@ impl Visibility for Auto {
         map.prove(stage);
         if worth_learning(map.passes) {
             map.learn();
+            map.asleep &= !self.restless;
         }
     }
 }

@@ -48,7 +48,8 @@ impl Visibility for Walled<'_> {
     }
 }
 
-fn trace(
+/// Asks everything.
+pub(super) fn trace(
     stage: &Stage<'_>,
     occluders: &[Occluders<'_>],
     questions: &Questions,

@@ -8,22 +8,23 @@ mod exact;
 mod map;
 mod stochastic;
 
-pub use auto::{Auto, AutoOptions};
+pub use auto::{Auto, AutoOptions, Learned, SavedMap, fingerprint};
 pub use exact::{Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
+use crate::clock;
 use crate::film::{Tile, TileFilm};
 use crate::light::AreaLight;
 use crate::sampler::{Pattern, Sampler};
 use crate::scene::{Frame, Scene};
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
-use occlude_kernel::occlusion_map::{Odds, bin};
+use occlude_kernel::occlusion_map::bin;
 use occlude_kernel::{Bvh, Counter, Counts, RayPacket, Simd, Uncounted, offset};
 use std::f32::consts::FRAC_1_PI;
 use std::ops::Range;
-use std::time::{Duration, Instant};
+use std::time::Duration;
 
 /// Everything a render reads and nothing writes.
 #[derive(Clone, Copy)]
@@ -77,6 +78,30 @@ pub trait Visibility: Sync {
     );
 }
 
+impl<V: Visibility + ?Sized> Visibility for &V {
+    fn begin(&self, stage: &Stage<'_>, tiles: &[Tile], width: u32) {
+        (**self).begin(stage, tiles, width);
+    }
+
+    fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
+        (**self).ask(stage, scratch);
+    }
+
+    fn passed(&self, stage: &Stage<'_>) {
+        (**self).passed(stage);
+    }
+
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        (**self).estimate(stage, questions, estimates, counts);
+    }
+}
+
 /// A point that light may reach.
 #[derive(Clone, Copy, Debug)]
 pub struct ShadingPoint {
@@ -124,10 +149,14 @@ pub struct Questions {
     pub weights: Vec<f32>,
     /// Pixels across the tile.
     pub width: u32,
-    /// Of methods that learn: what they think of each sample, and where they keep what becomes of it.
-    odds: Vec<Option<Odds>>,
-    places: Vec<u32>,
+    /// Of methods that learn: for each batch the cell that wants to hear of it, or [`NOBODY`], and for each sample of
+    /// those the bin of the light.
+    cells: Vec<u32>,
+    bins: Vec<u8>,
 }
+
+/// Who wants to hear of a batch if nobody does.
+const NOBODY: u32 = u32::MAX;
 
 impl Questions {
     fn clear(&mut self) {
@@ -135,12 +164,12 @@ impl Questions {
         self.batches.clear();
         self.targets.iter_mut().for_each(Vec::clear);
         self.weights.clear();
-        self.odds.clear();
-        self.places.clear();
+        self.cells.clear();
+        self.bins.clear();
     }
 }
 
-/// Where the time went, summed over threads.
+/// Where the time went, summed over threads: time they worked, where the system tells ([`crate::clock`]).
 #[derive(Clone, Copy, Debug, Default)]
 pub struct StageTimes {
     /// Camera rays and their nearest hits.
@@ -225,19 +254,19 @@ fn render_paths(
     film: &mut TileFilm,
     scratch: &mut Scratch,
 ) {
-    let start = Instant::now();
+    let start = clock::of_thread();
     cast(stage, film.tile(), width, scratch);
-    let cast_end = Instant::now();
+    let cast_end = clock::of_thread();
     method.ask(stage, scratch);
-    let light_end = Instant::now();
+    let light_end = clock::of_thread();
     method.estimate(stage, &scratch.questions, &mut scratch.estimates, &mut scratch.shadow_counts);
-    let visibility_end = Instant::now();
+    let visibility_end = clock::of_thread();
     shade(stage, film, scratch);
     scratch.times += StageTimes {
         camera: cast_end - start,
         light: light_end - cast_end,
         visibility: visibility_end - light_end,
-        shade: visibility_end.elapsed(),
+        shade: clock::of_thread() - visibility_end,
     };
 }
 
@@ -334,26 +363,38 @@ const FAIR_SHARE: f32 = 0.1;
 /// light due `e` rays gets `floor(e)` or `ceil(e)`, and `e` on average. Where that is never 0 its samples are
 /// averaged (weight 1/n), which is right for either number; else they are weighed by 1/e.
 fn divide(stage: &Stage<'_>, point: &ShadingPoint, sampler: &mut Sampler, shares: &mut Vec<Share>) {
+    expect(stage, point, shares);
+    round(stage, sampler, shares, true);
+}
+
+/// How many samples each light that a point may see is due.
+fn expect(stage: &Stage<'_>, point: &ShadingPoint, shares: &mut Vec<Share>) {
     shares.clear();
     shares.extend(stage.lights.iter().enumerate().filter_map(|(light, area)| {
         let unshadowed = area.unshadowed(point.x, point.normal)?;
-        Some(Share { light: light as u32, unshadowed, count: 0, each: 0.0 })
+        Some(Share { light: light as u32, unshadowed, expected: 0.0, boost: 1.0, count: 0, each: 0.0 })
     }));
     let value = |share: &Share| share.unshadowed * stage.lights[share.light as usize].radiance.element_sum();
     let total: f32 = shares.iter().map(value).sum();
     let fair = FAIR_SHARE / shares.len() as f32;
+    for share in shares.iter_mut() {
+        share.expected = stage.shadow_rays as f32 * ((1.0 - FAIR_SHARE) * value(share) / total + fair);
+    }
+}
+
+/// How many each gets; `all` if the rays are given in the end, whatever rounding does.
+fn round(stage: &Stage<'_>, sampler: &mut Sampler, shares: &mut [Share], all: bool) {
     let mut due = f64::from(sampler.uniform());
     let mut given = 0u32;
     let last = shares.len().saturating_sub(1);
     for (place, share) in shares.iter_mut().enumerate() {
-        let expected = stage.shadow_rays as f32 * ((1.0 - FAIR_SHARE) * value(share) / total + fair);
-        due += f64::from(expected);
-        // All of the rays are given in the end, whatever rounding does.
-        let until = if place == last { stage.shadow_rays } else { due as u32 };
-        let until = until.clamp(given, stage.shadow_rays);
+        due += f64::from(share.expected);
+        let until = if all && place == last { stage.shadow_rays } else { due as u32 };
+        let until = if all { until.clamp(given, stage.shadow_rays) } else { until };
         share.count = until - given;
         given = until;
-        share.each = if expected > 1.001 { 1.0 / share.count as f32 } else { 1.0 / expected };
+        let each = if share.expected > 1.001 { 1.0 / share.count as f32 } else { 1.0 / share.expected };
+        share.each = each * share.boost;
     }
 }
 
@@ -363,6 +404,10 @@ struct Share {
     light: u32,
     /// Irradiance with nothing in the way, of radiance 1.
     unshadowed: f32,
+    /// Samples it is due, and those it gets.
+    expected: f32,
+    /// How many times more each counts than it would by their number.
+    boost: f32,
     count: u32,
     each: f32,
 }
@@ -376,9 +421,18 @@ struct Fan {
     weights: Vec<f32>,
     /// Which part of the light they lie in.
     bins: Vec<u8>,
+    /// How many times as likely as with an even density, if they follow another.
+    densities: Vec<f32>,
 }
 
 impl Fan {
+    fn resize(&mut self, count: usize) {
+        self.targets.iter_mut().for_each(|axis| axis.resize(count, 0.0));
+        self.weights.resize(count, 0.0);
+        self.bins.resize(count, 0);
+        self.densities.resize(count, 1.0);
+    }
+
     /// Opens it to points of the light's unit square.
     fn open(
         &mut self,
@@ -388,19 +442,14 @@ impl Fan {
         square: &[[f32; 2]],
         each: f32,
     ) {
-        self.targets.iter_mut().for_each(|axis| axis.resize(square.len(), 0.0));
-        self.weights.resize(square.len(), 0.0);
-        self.bins.resize(square.len(), 0);
+        self.resize(square.len());
         let clearance = stage.bvh.clearance();
         dispatch(stage.level, Open { fan: self, area, point, square, each, clearance });
     }
 
-    /// Some of the samples.
-    fn append_some_to(&self, some: &[u32], questions: &mut Questions) {
-        for (to, from) in questions.targets.iter_mut().zip(&self.targets) {
-            to.extend(some.iter().map(|&i| from[i as usize]));
-        }
-        questions.weights.extend(some.iter().map(|&i| self.weights[i as usize]));
+    /// The bins of the samples that send something.
+    fn append_bins_to(&self, bins: &mut Vec<u8>) {
+        bins.extend(self.bins.iter().zip(&self.weights).filter(|(_, w)| **w > 0.0).map(|(bin, _)| bin));
     }
 
     /// The samples that send something.

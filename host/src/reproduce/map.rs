@@ -2,8 +2,9 @@
 
 mod ways;
 
-use super::{Halted, Leg, Reproduced, Run, thread_time};
+use super::{Halted, Leg, Reproduced, Run};
 use crate::accel::{Accel, Quality};
+use crate::clock;
 use crate::error::Error;
 use crate::film::{Image, Tile};
 use crate::generate::{Kind, generate};
@@ -198,9 +199,9 @@ impl Setting {
         let photons = prepared.store.by_light();
         let look = |&tile: &Tile| {
             let asked = questions(&stage, tile, self.size.0, 0);
-            let start = thread_time();
+            let start = clock::of_thread();
             let called = dispatch(stage.level, Judge { prepared, photons: &photons, questions: &asked });
-            (thread_time() - start, called.len())
+            (clock::of_thread() - start, called.len())
         };
         let times: Vec<(Duration, usize)> = tiles.par_iter().map(look).collect();
         times.iter().map(|(time, _)| time.as_secs_f64()).sum()
@@ -256,9 +257,9 @@ impl Visibility for Timed<'_> {
         estimates: &mut Vec<f32>,
         counts: &mut Counts,
     ) {
-        let start = thread_time();
+        let start = clock::of_thread();
         self.method.estimate(stage, questions, estimates, counts);
-        self.spent.fetch_add((thread_time() - start).as_nanos() as u64, Ordering::Relaxed);
+        self.spent.fetch_add((clock::of_thread() - start).as_nanos() as u64, Ordering::Relaxed);
     }
 }
 

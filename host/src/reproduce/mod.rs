@@ -57,20 +57,6 @@ pub struct Reproduced {
     pub data: Vec<(&'static str, Data)>,
 }
 
-/// CPU time of this thread so far, in which work of other processes hardly shows; where that is not told, time.
-pub(crate) fn thread_time() -> std::time::Duration {
-    #[cfg(unix)]
-    {
-        let time = rustix::time::clock_gettime(rustix::time::ClockId::ThreadCPUTime);
-        std::time::Duration::new(time.tv_sec as u64, time.tv_nsec as u32)
-    }
-    #[cfg(not(unix))]
-    {
-        static START: std::sync::OnceLock<std::time::Instant> = std::sync::OnceLock::new();
-        START.get_or_init(std::time::Instant::now).elapsed()
-    }
-}
-
 /// A part of a run, from one share of the whole to another.
 #[derive(Clone, Copy)]
 pub(crate) struct Leg<'a> {
