@@ -378,8 +378,7 @@ impl Pyramid {
             s.store(&mut this.s[i..]);
             t.store(&mut this.t[i..]);
             w.store(&mut this.w[i..]);
-            let sum = s + t + w;
-            odd = odd + (sum - sum);
+            odd = odd + (s + t + w) * P::<S>::splat(token, 0.0);
             let [a, b, c] = vec3x::abs(d);
             let first = (b.le(a) & c.le(a)).bits();
             let second = c.le(b).bits() & !first;

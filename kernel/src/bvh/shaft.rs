@@ -47,7 +47,7 @@ impl<L: Lanes> Around<L> {
             let at = position[0].mul_add(x, position[1].mul_add(y, position[2] * z));
             self.low[k] = self.low[k].min(at);
             self.high[k] = self.high[k].max(at);
-            self.odd = self.odd + (at - at);
+            self.odd = self.odd + at * L::splat(token, 0.0);
             k += 1;
         }
     }

@@ -350,13 +350,10 @@ impl<S: Simd> Bvh<'_, S> {
             fill_all(blocked, points);
             return;
         }
-        let unwalled = walls.is_empty();
         let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls };
         let least = if complete { PARTED } else { FINE };
-        let apart = rays >= least * points.len()
-            && points.len() > PART
-            && unwalled
-            && !(complete && given.count <= SHORT);
+        let apart =
+            rays >= least * points.len() && points.len() > PART && !(complete && given.count <= SHORT);
         let Some(whole) = shaft.as_ref().filter(|_| apart) else {
             let shaft = shaft.as_ref();
             self.ask_points(shaft, complete, points, targets, cut, given, ignore, counter, work, blocked);
@@ -820,6 +817,7 @@ impl<S: Simd> Bvh<'_, S> {
 
     /// Goes down the tree with the shaft. True if the list holds all that may block anything; else what is not
     /// in it is below the cut.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn gather(
         &self,
