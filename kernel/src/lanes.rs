@@ -13,7 +13,7 @@
 //! conservative, use [`Lanes::mul_add`], whose rounding differs between families.
 
 use core::fmt::Debug;
-use core::ops::{Add, BitAnd, BitOr, Div, Mul, Neg, Sub};
+use core::ops::{Add, BitAnd, BitOr, BitXor, Div, Mul, Neg, Sub};
 
 #[cfg(feature = "dispatch")]
 mod dispatched;
@@ -23,7 +23,7 @@ pub use dispatched::Dispatched16;
 pub use dispatched::{Dispatched, Level, Task, detect, dispatch, level_name, level_named, levels};
 
 /// One bool for each lane.
-pub trait Mask: Copy + Debug + BitAnd<Output = Self> + BitOr<Output = Self> {
+pub trait Mask: Copy + Debug + BitAnd<Output = Self> + BitOr<Output = Self> + BitXor<Output = Self> {
     /// The lanes as bits, lane 0 in the lowest.
     fn bits(self) -> u32;
     /// Is any lane set?
@@ -214,6 +214,14 @@ macro_rules! wide_lanes {
             #[inline(always)]
             fn bitor(self, other: Self) -> Self {
                 Self(self.0 | other.0)
+            }
+        }
+
+        impl BitXor for $mask {
+            type Output = Self;
+            #[inline(always)]
+            fn bitxor(self, other: Self) -> Self {
+                Self(self.0 ^ other.0)
             }
         }
 

@@ -27,6 +27,7 @@
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::vec3x::{self, Vec3x};
 use bytemuck::{Pod, Zeroable};
+use core::hint::black_box;
 use glam::Vec3;
 
 /// Marks an unused lane of a [`TriangleBlock`]. No triangle may have this number.
@@ -138,10 +139,65 @@ impl<L: Lanes> Turn<L> {
     }
 }
 
+/// Triangles, one a lane, read number by number: what a test reads again need not stand in registers meanwhile.
+pub(crate) trait Corners<L: Lanes>: Copy {
+    /// An axis of a vertex.
+    fn at(&self, token: L::Token, vertex: usize, axis: usize) -> L;
+
+    /// The same, as one that the compiler knows nothing of: numbers read from it are not kept from before.
+    fn again(self) -> Self;
+
+    /// A vertex.
+    #[inline(always)]
+    fn vertex(&self, token: L::Token, vertex: usize) -> Vec3x<L> {
+        [self.at(token, vertex, 0), self.at(token, vertex, 1), self.at(token, vertex, 2)]
+    }
+}
+
+/// The triangles of a block from a lane on.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Across<'b> {
+    pub(crate) block: &'b TriangleBlock,
+    pub(crate) from: usize,
+}
+
+impl<L: Lanes> Corners<L> for Across<'_> {
+    #[inline(always)]
+    fn at(&self, token: L::Token, vertex: usize, axis: usize) -> L {
+        L::load(token, &self.block.vertices[vertex][axis][self.from..])
+    }
+
+    #[inline(always)]
+    fn again(self) -> Self {
+        Self { block: black_box(self.block), from: self.from }
+    }
+}
+
+/// The triangle in a lane of a block, for all rays.
+#[derive(Clone, Copy, Debug)]
+pub(crate) struct Single<'b> {
+    pub(crate) block: &'b TriangleBlock,
+    pub(crate) lane: usize,
+}
+
+impl<L: Lanes> Corners<L> for Single<'_> {
+    #[inline(always)]
+    fn at(&self, token: L::Token, vertex: usize, axis: usize) -> L {
+        L::splat(token, self.block.vertices[vertex][axis][self.lane])
+    }
+
+    #[inline(always)]
+    fn again(self) -> Self {
+        Self { block: black_box(self.block), lane: self.lane }
+    }
+}
+
 /// A ray as the triangle test wants it, one a lane.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Sheared<L: Lanes> {
     pub(crate) turn: Turn<L>,
+    /// The origin along x, y and z of the test.
+    pub(crate) turned: Vec3x<L>,
     /// By world axis.
     pub(crate) origin: Vec3x<L>,
     /// By world axis.
@@ -175,45 +231,63 @@ impl<L: Lanes> Sheared<L> {
     ) -> Self {
         let [x, y, z] = turn.of(direction);
         let step = L::splat(token, 1.0) / z;
-        Self { turn, origin, direction, shear: [x * step, y * step, step], t_min, t_max }
+        let turned = turn.of(origin);
+        Self { turn, turned, origin, direction, shear: [x * step, y * step, step], t_min, t_max }
     }
 
     /// A vertex with the ray's origin at 0 and the ray along z.
     #[inline(always)]
-    fn vertex(&self, vertex: Vec3x<L>) -> Vec3x<L> {
-        let [x, y, depth] = self.turn.of(vec3x::sub(vertex, self.origin));
+    fn vertex(&self, token: L::Token, triangle: impl Corners<L>, vertex: usize) -> Vec3x<L> {
+        let at = match self.turn {
+            Turn::Same(axes) => [
+                triangle.at(token, vertex, axes.x),
+                triangle.at(token, vertex, axes.y),
+                triangle.at(token, vertex, axes.z),
+            ],
+            Turn::Each(_) => self.turn.of(triangle.vertex(token, vertex)),
+        };
+        let [x, y, depth] = vec3x::sub(at, self.turned);
         [x - self.shear[0] * depth, y - self.shear[1] * depth, depth]
     }
 
     /// Where these rays meet these triangles, lane by lane; either side may be splatted. NaN is a miss.
     #[inline(always)]
-    pub(crate) fn cross(&self, token: L::Token, triangle: [Vec3x<L>; 3]) -> Crossing<L> {
-        let [a, b, c] = [self.vertex(triangle[0]), self.vertex(triangle[1]), self.vertex(triangle[2])];
+    pub(crate) fn cross(&self, token: L::Token, triangle: impl Corners<L>) -> Crossing<L> {
+        let a = self.vertex(token, triangle, 0);
+        let b = self.vertex(token, triangle, 1);
+        let c = self.vertex(token, triangle, 2);
         let u = c[0] * b[1] - c[1] * b[0];
         let v = a[0] * c[1] - a[1] * c[0];
         let w = b[0] * a[1] - b[1] * a[0];
         let zero = L::splat(token, 0.0);
-        // With a sign of each kind a lane is outside, which is what most are; NaN and zeros are looked at below.
+        // Nothing below zero or nothing above: inside. Both: outside. Neither: edge-on or a point, which is missed.
         let (least, most) = (u.min(v).min(w), u.max(v).max(w));
-        let outside = least.lt(zero) & zero.lt(most);
+        let may = least.lt(zero) ^ zero.lt(most);
         let det = u + v + w;
-        if outside.bits() == u32::MAX >> (32 - L::WIDTH) {
-            return Crossing { hit: zero.lt(zero), det, t: zero, u: v, v: w };
+        if !may.any() {
+            return Crossing { hit: may, det, t: zero, u: v, v: w };
         }
+        // What remains to be told apart is NaN, which may have got lost above.
         let front = zero.le(u) & zero.le(v) & zero.le(w) & zero.lt(det);
         let back = u.le(zero) & v.le(zero) & w.le(zero) & det.lt(zero);
         let inside = front | back;
-        if !inside.any() {
-            return Crossing { hit: inside, det, t: zero, u: v, v: w };
-        }
+        // Few come here, so nothing is kept for it.
+        let triangle = triangle.again();
+        let a = self.vertex(token, triangle, 0);
+        let b = self.vertex(token, triangle, 1);
+        let c = self.vertex(token, triangle, 2);
         // Of a triangle seen edge-on the signs are rounding: then the ray must at least meet its box.
         let x = a[0].min(b[0]).min(c[0]).le(zero) & zero.le(a[0].max(b[0]).max(c[0]));
         let y = a[1].min(b[1]).min(c[1]).le(zero) & zero.le(a[1].max(b[1]).max(c[1]));
         let inside = inside & x & y;
         // Where the line crosses the plane. The weights would give t too, but for long thin triangles they are
         // small differences of large products, and t is off by more than a point is moved off its surface.
-        let n = vec3x::cross(vec3x::sub(triangle[1], triangle[0]), vec3x::sub(triangle[2], triangle[0]));
-        let t = vec3x::dot(n, vec3x::sub(triangle[0], self.origin)) / vec3x::dot(n, self.direction);
+        let first = triangle.vertex(token, 0);
+        let n = vec3x::cross(
+            vec3x::sub(triangle.vertex(token, 1), first),
+            vec3x::sub(triangle.vertex(token, 2), first),
+        );
+        let t = vec3x::dot(n, vec3x::sub(first, self.origin)) / vec3x::dot(n, self.direction);
         // Seen edge-on that is a quotient of rounding errors, but t lies between those of the vertices.
         let [a, b, c] = [a[2] * self.shear[2], b[2] * self.shear[2], c[2] * self.shear[2]];
         let (first, last) = (a.min(b).min(c), a.max(b).max(c));
@@ -232,10 +306,7 @@ where
     pub(crate) fn cross_block(&self, token: S::Token, block: &TriangleBlock, found: &mut Found) -> u32 {
         let mut hits = 0;
         for from in (0..TriangleBlock::WIDTH).step_by(S::WIDTH) {
-            let [a, b, c] = &block.vertices;
-            let triangle =
-                [vec3x::load(token, a, from), vec3x::load(token, b, from), vec3x::load(token, c, from)];
-            let crossing = self.cross(token, triangle);
+            let crossing = self.cross(token, Across { block, from });
             let bits = crossing.hit.bits();
             if bits != 0 {
                 crossing.det.store(&mut found.det[from..]);
@@ -285,6 +356,7 @@ pub(crate) fn shear_one<S: Simd>(simd: S, ray: &crate::Ray, axis: usize) -> Shea
     let step = 1.0 / ray.direction[axes.z];
     Sheared {
         turn: Turn::Same(axes),
+        turned: vec3x::splat(token, [ray.origin[axes.x], ray.origin[axes.y], ray.origin[axes.z]]),
         origin: vec3x::splat(token, ray.origin.to_array()),
         direction: vec3x::splat(token, ray.direction.to_array()),
         shear: vec3x::splat(token, [ray.direction[axes.x] * step, ray.direction[axes.y] * step, step]),

@@ -18,7 +18,7 @@ use super::tile::TilePoint;
 use super::{Bvh, ROUNDING, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
-use crate::triangle::{NO_TRIANGLE, Sheared, TriangleBlock, Turn};
+use crate::triangle::{NO_TRIANGLE, Sheared, Single, TriangleBlock, Turn};
 use crate::vec3x::{self, Vec3x};
 use glam::Vec3;
 
@@ -281,11 +281,6 @@ impl<S: Simd> Bvh<'_, S> {
     ) -> u64 {
         let token = self.simd.token();
         let origin = vec3x::splat::<S::Packet>(token, x);
-        let triangle = [
-            vec3x::broadcast(token, &block.vertices[0], lane),
-            vec3x::broadcast(token, &block.vertices[1], lane),
-            vec3x::broadcast(token, &block.vertices[2], lane),
-        ];
         let (begin, end) = (S::Packet::splat(token, 0.0), S::Packet::splat(token, 1.0));
         let mut blocked = 0;
         let mut i = 0;
@@ -298,7 +293,7 @@ impl<S: Simd> Bvh<'_, S> {
                 // The rule of `Axes::dominant`.
                 let turn = Turn::Each([b.le(a) & c.le(a), c.le(b)]);
                 let sheared = Sheared::new(token, turn, origin, direction, begin, end);
-                blocked |= (u64::from(sheared.cross(token, triangle).hit.bits()) & asked) << i;
+                blocked |= (u64::from(sheared.cross(token, Single { block, lane }).hit.bits()) & asked) << i;
             }
             i += S::Packet::WIDTH;
         }

@@ -5,7 +5,7 @@ use super::{Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::{Hit, RayPacket};
-use crate::triangle::{Axes, Found, Sheared, TriangleBlock, Turn};
+use crate::triangle::{Axes, Found, Sheared, Single, TriangleBlock, Turn};
 use crate::vec3x::{self, Vec3x};
 use arrayvec::ArrayVec;
 use core::ops::ControlFlow;
@@ -193,6 +193,11 @@ impl Ends {
     fn sheared<L: Lanes>(&self, token: L::Token, axes: Axes, lane: usize, t_max: f32) -> Sheared<L> {
         Sheared {
             turn: Turn::Same(axes),
+            turned: [
+                L::splat(token, self.origin[axes.x][lane]),
+                L::splat(token, self.origin[axes.y][lane]),
+                L::splat(token, self.origin[axes.z][lane]),
+            ],
             origin: vec3x::broadcast(token, &self.origin, lane),
             direction: vec3x::broadcast(token, &self.direction, lane),
             shear: vec3x::broadcast(token, &self.shear, lane),
@@ -488,15 +493,9 @@ impl<S: Simd> Bvh<'_, S> {
                 continue;
             }
             counter.triangle_tests((meet & this.active).count_ones());
-            let [a, b, c] = &block.vertices;
-            let triangle = [
-                vec3x::broadcast(token, a, lane),
-                vec3x::broadcast(token, b, lane),
-                vec3x::broadcast(token, c, lane),
-            ];
             let at = lane;
             lane += 1;
-            let crossing = this.sheared.cross(token, triangle);
+            let crossing = this.sheared.cross(token, Single { block, lane: at });
             let bits = crossing.hit.bits() & meet & this.active;
             if bits == 0 {
                 continue;

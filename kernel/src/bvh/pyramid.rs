@@ -23,7 +23,7 @@ use super::{Bvh, Child, Node, Part, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::Ray;
-use crate::triangle::{Axes, Found, Sheared, TriangleBlock, Turn, shear_one};
+use crate::triangle::{Axes, Found, Sheared, Single, TriangleBlock, Turn, shear_one};
 use crate::vec3x;
 use arrayvec::ArrayVec;
 use glam::Vec3;
@@ -793,11 +793,6 @@ impl Pyramid {
             S::Packet::load(token, &self.direction[2][i..]),
         ];
         let origin = vec3x::splat(token, self.x.to_array());
-        let triangle = [
-            vec3x::broadcast(token, &block.vertices[0], lane),
-            vec3x::broadcast(token, &block.vertices[1], lane),
-            vec3x::broadcast(token, &block.vertices[2], lane),
-        ];
         let (begin, end) = (S::Packet::splat(token, 0.0), S::Packet::splat(token, 1.0));
         let mut blocked = 0;
         let mut axis = 0;
@@ -805,7 +800,7 @@ impl Pyramid {
             let asked = ask & (self.along[axis] >> i);
             if asked != 0 {
                 let sheared = Sheared::new(token, Turn::Same(Axes::of(axis)), origin, direction, begin, end);
-                blocked |= u64::from(sheared.cross(token, triangle).hit.bits()) & asked;
+                blocked |= u64::from(sheared.cross(token, Single { block, lane }).hit.bits()) & asked;
             }
             axis += 1;
         }
