@@ -296,11 +296,13 @@ impl<S: Simd> Bvh<'_, S> {
         visitor: &mut V,
     ) -> Option<Place> {
         let token = self.simd.token();
-        let mut levels = [(0u32, 0u32); MAX_DEPTH];
+        let mut found = Found::NOTHING;
+        let mut entry = [0.0; 8];
+        // A level's node, and a bit for each of its children that is left to visit. None waits that has no bit.
+        let mut waiting = [(0u32, 0u32); MAX_DEPTH];
         let mut level = 0;
         let mut next = subtree;
-        let mut entry = [0.0; 8];
-        let mut found = Found::NOTHING;
+        let (mut node, mut left) = (0, 0);
         loop {
             if next.is_leaf() {
                 let block = &self.blocks[next.index()];
@@ -315,24 +317,26 @@ impl<S: Simd> Bvh<'_, S> {
                     }
                 }
             } else {
-                let node = &self.nodes[next.index()];
-                counter.node_tests(node.len());
-                // Depth is checked at construction, so there is always room.
-                levels[level] =
-                    (next.index() as u32, slabs.children(token, node, visitor.t_max(), &mut entry));
-                level += 1;
+                if left != 0 {
+                    // Depth is checked at construction, so there is always room.
+                    waiting[level] = (node, left);
+                    level += 1;
+                }
+                node = next.index() as u32;
+                let here = &self.nodes[next.index()];
+                counter.node_tests(here.len());
+                left = slabs.children(token, here, visitor.t_max(), &mut entry);
             }
             next = loop {
-                if level == 0 {
-                    return None;
-                }
-                let (node, left) = levels[level - 1];
                 if left == 0 {
+                    if level == 0 {
+                        return None;
+                    }
                     level -= 1;
-                    continue;
+                    (node, left) = waiting[level];
                 }
-                levels[level - 1].1 = left & (left - 1);
                 let child = self.nodes[node as usize].children[left.trailing_zeros() as usize & 7];
+                left &= left - 1;
                 // Its box is empty, or was never looked at: nothing promises that no ray meets it.
                 if child != Child::NONE && part.below(child) {
                     break child;
