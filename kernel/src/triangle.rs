@@ -320,6 +320,20 @@ where
     }
 }
 
+impl<S: Lanes> Sheared<S> {
+    /// The lanes of a block that one ray hits, as bits.
+    #[inline(always)]
+    pub(crate) fn block_hits(&self, token: S::Token, block: &TriangleBlock) -> u32 {
+        let mut hits = 0;
+        let mut from = 0;
+        while from < TriangleBlock::WIDTH {
+            hits |= self.cross(token, Across { block, from }).hit.bits() << from;
+            from += S::WIDTH;
+        }
+        hits
+    }
+}
+
 /// Crossings as arrays; a lane counts where the test's bit is set.
 #[derive(Clone, Copy, Debug)]
 pub(crate) struct Found {

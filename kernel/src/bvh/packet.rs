@@ -207,9 +207,22 @@ impl Ends {
     }
 }
 
-/// As many rays of a packet or fewer go on one by one: of sixteen 5, of eight 3.
-const fn alone(width: usize) -> u32 {
-    width as u32 / 4 + 1
+/// As many rays of a packet or fewer meet all boxes of a node one by one: more of them meet the boxes one by one, all at
+/// once.
+const FEW_AT_NODE: u32 = 6;
+
+/// The same with the triangles of a block, of which there are fewer.
+const FEW_AT_BLOCK: u32 = 3;
+
+/// The 8 by 8 bits of a word, rows as columns.
+#[inline(always)]
+fn transposed(x: u64) -> u64 {
+    let t = (x ^ (x >> 7)) & 0x00aa_00aa_00aa_00aa;
+    let x = x ^ t ^ (t << 7);
+    let t = (x ^ (x >> 14)) & 0x0000_cccc_0000_cccc;
+    let x = x ^ t ^ (t << 14);
+    let t = (x ^ (x >> 28)) & 0x0000_0000_f0f0_f0f0;
+    x ^ t ^ (t << 28)
 }
 
 impl<S: Simd> Bvh<'_, S> {
@@ -435,35 +448,26 @@ impl<S: Simd> Bvh<'_, S> {
             if meet == 0 {
                 continue;
             }
-            if V::ANY && meet.count_ones() <= alone(S::Packet::WIDTH) {
-                if ends.is_none() {
-                    ends = Some(Ends::of(slabs, &this.sheared));
+            let few = V::ANY && meet.count_ones() <= if next.is_leaf() { FEW_AT_BLOCK } else { FEW_AT_NODE };
+            if few && ends.is_none() {
+                ends = Some(Ends::of(slabs, &this.sheared));
+            }
+            match &ends {
+                Some(ends) if few && next.is_leaf() => {
+                    let block = &self.blocks[next.index()];
+                    self.meet_block_each(block, meet, along, ends, &mut this, part, counter, visitor);
                 }
-                let Some(ends) = &ends else { return };
-                let mut left = meet;
-                while left != 0 {
-                    let lane = left.trailing_zeros() as usize & 15;
-                    left &= left - 1;
-                    let t_max = this.t_max[lane];
-                    let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, lane, ends.t_min[lane]);
-                    let axis =
-                        usize::from(along[1] >> lane & 1 != 0) + 2 * usize::from(along[2] >> lane & 1 != 0);
-                    let sheared = ends.sheared(token, Axes::of(axis), lane, t_max);
-                    if let Some(place) = self.blocker_of(next, &slabs, &sheared, t_max, part, counter) {
-                        this.active &= !visitor.hits(
-                            1 << lane,
-                            &self.blocks[place.block],
-                            place.lane,
-                            &Found::NOTHING,
-                            &mut this.t_max,
-                        );
-                    }
+                Some(ends) if few => {
+                    let node = &self.nodes[next.index()];
+                    self.meet_node_each(node, meet, ends, &this, &mut stack, part, counter);
                 }
-            } else if next.is_leaf() {
-                self.meet_block(&self.blocks[next.index()], meet, &mut this, part, counter, visitor);
-            } else {
-                let node = &self.nodes[next.index()];
-                self.meet_node::<V>(node, meet, slabs, &mut this, &mut stack, part, counter);
+                _ if next.is_leaf() => {
+                    self.meet_block(&self.blocks[next.index()], meet, &mut this, part, counter, visitor);
+                }
+                _ => {
+                    let node = &self.nodes[next.index()];
+                    self.meet_node::<V>(node, meet, slabs, &mut this, &mut stack, part, counter);
+                }
             }
             if this.active == 0 {
                 return;
@@ -534,8 +538,10 @@ impl<S: Simd> Bvh<'_, S> {
         let token = self.simd.token();
         counter.node_tests(node.len() * meet.count_ones());
         let first = stack.len();
-        let mut place = 0;
-        while place < Node::WIDTH {
+        // The first child comes on top.
+        let mut place = Node::WIDTH;
+        while place > 0 {
+            place -= 1;
             let child = node.children[place];
             if child != Child::NONE && part.below(child) {
                 let (hit, enter) = slabs.meet(token, node, place, this.sheared.t_max);
@@ -556,7 +562,81 @@ impl<S: Simd> Bvh<'_, S> {
                     }
                 }
             }
-            place += 1;
+        }
+    }
+
+    /// A block that few rays meet: each of them with all of its triangles.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn meet_block_each<V: PacketVisitor<S::Packet>>(
+        &self,
+        block: &TriangleBlock,
+        meet: u32,
+        along: [u32; 3],
+        ends: &Ends,
+        this: &mut Going<S::Packet>,
+        part: impl Part,
+        counter: &mut impl Counter,
+        visitor: &mut V,
+    ) {
+        let token = self.simd.token();
+        let mut left = meet;
+        while left != 0 {
+            let ray = left.trailing_zeros() as usize & 15;
+            left &= left - 1;
+            let axis = usize::from(along[1] >> ray & 1 != 0) + 2 * usize::from(along[2] >> ray & 1 != 0);
+            let sheared = ends.sheared::<S::Node>(token, Axes::of(axis), ray, this.t_max[ray]);
+            counter.triangle_tests(part.count(block));
+            let mut hits = sheared.block_hits(token, block);
+            while hits != 0 {
+                let lane = hits.trailing_zeros() as usize & 7;
+                hits &= hits - 1;
+                if part.holds(block.ids[lane]) {
+                    this.active &= !visitor.hits(1 << ray, block, lane, &Found::NOTHING, &mut this.t_max);
+                    break;
+                }
+            }
+        }
+    }
+
+    /// A node that few rays meet: each of them with all of its boxes.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn meet_node_each(
+        &self,
+        node: &Node,
+        meet: u32,
+        ends: &Ends,
+        this: &Going<S::Packet>,
+        stack: &mut ArrayVec<(Child, u32, f32), STACK>,
+        part: impl Part,
+        counter: &mut impl Counter,
+    ) {
+        let token = self.simd.token();
+        counter.node_tests(node.len() * meet.count_ones());
+        // The children that each ray meets, a byte a ray, and those that any of them meets.
+        let (mut rows, mut any) = ([0u64; 2], 0);
+        let mut entry = [0.0; 8];
+        let mut left = meet;
+        while left != 0 {
+            let ray = left.trailing_zeros() as usize & 15;
+            left &= left - 1;
+            let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, ray, ends.t_min[ray]);
+            let met = slabs.children(token, node, this.t_max[ray], &mut entry);
+            any |= met;
+            rows[ray / 8] |= u64::from(met) << (8 * (ray % 8));
+        }
+        let columns = [transposed(rows[0]), if S::Packet::WIDTH > 8 { transposed(rows[1]) } else { 0 }];
+        while any != 0 {
+            // The first child comes on top.
+            let place = 31 - any.leading_zeros() as usize & 7;
+            any &= !(1 << place);
+            let child = node.children[place];
+            if child != Child::NONE && part.below(child) {
+                let meet = columns[0] >> (8 * place) & 0xff | (columns[1] >> (8 * place) & 0xff) << 8;
+                // Depth is checked at construction, so there is always room.
+                stack.push((child, meet as u32, 0.0));
+            }
         }
     }
 }
