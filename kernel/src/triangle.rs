@@ -125,6 +125,13 @@ pub(crate) enum Turn<L: Lanes> {
 }
 
 impl<L: Lanes> Turn<L> {
+    /// By the longest axis of each direction: the rule of [`Axes::dominant`].
+    #[inline(always)]
+    pub(crate) fn each(direction: Vec3x<L>) -> Self {
+        let [x, y, z] = vec3x::abs(direction);
+        Self::Each([y.le(x) & z.le(x), z.le(y)])
+    }
+
     /// The components of a vector along x, y and z.
     #[inline(always)]
     fn of(&self, [x, y, z]: Vec3x<L>) -> Vec3x<L> {

@@ -1,7 +1,8 @@
 //! One point and many points on a light: which of the segments are blocked?
 
-use super::packet::{Any, Rays, Start};
-use super::pyramid::{Forgetful, Going, Learn, Learner, MOST, Pyramid, Stack};
+use super::packet::Rays;
+use super::pyramid::{Forgetful, Going, Learner, MOST, Pyramid, Stack};
+use super::stream::{Start, Stream};
 use super::{Bvh, CUT, Child, Part};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
@@ -120,16 +121,17 @@ impl<'a> Targets<'a> {
     }
 }
 
-/// What a batch works in: keep one a thread, so that nothing is cleared between queries. About six kilobytes.
+/// What a batch works in: keep one a thread, so that nothing is cleared between queries. About twelve kilobytes.
 pub struct BatchScratch {
     pub(super) pyramid: Pyramid,
     pub(super) stack: Stack,
+    pub(super) stream: Stream,
 }
 
 impl BatchScratch {
     /// Ready for any query.
     pub const fn new() -> Self {
-        Self { pyramid: Pyramid::EMPTY, stack: Stack::new_const() }
+        Self { pyramid: Pyramid::EMPTY, stack: Stack::new_const(), stream: Stream::EMPTY }
     }
 }
 
@@ -182,11 +184,11 @@ impl<S: Simd> Bvh<'_, S> {
         while from < targets.len() {
             let count = (targets.len() - from).min(MOST);
             blocked[from / MOST] = if count < FEW || self.nodes.is_empty() {
-                self.packets_from_root(x, targets, from, count, part, counter)
+                self.rays_from_root(&mut scratch.stream, x, targets, from, count, part, counter)
             } else if scratch.pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
-                self.pyramid_blocked(&mut scratch.pyramid, &mut scratch.stack, part, counter)
+                self.pyramid_blocked(scratch, part, counter)
             } else {
-                self.packets_from_root(x, targets, from, count, part, counter)
+                self.rays_from_root(&mut scratch.stream, x, targets, from, count, part, counter)
             };
             from += MOST;
         }
@@ -214,10 +216,10 @@ impl<S: Simd> Bvh<'_, S> {
             let count = (targets.len() - from).min(MOST);
             let every = u64::MAX >> (64 - count);
             counter.rays(count as u32);
-            let BatchScratch { pyramid, stack } = &mut *scratch;
+            let BatchScratch { pyramid, stack, stream } = &mut *scratch;
             let free =
                 if count >= FEW && pyramid.aim(self.simd, x.into(), targets, from, count, self.magnitude) {
-                    self.pyramid_left_by(subtrees, pyramid, stack, part, counter)
+                    self.pyramid_left_by(subtrees, pyramid, stack, stream, part, counter)
                 } else {
                     let mut free = every;
                     let mut i = 0;
@@ -246,6 +248,7 @@ impl<S: Simd> Bvh<'_, S> {
         subtrees: &[Child],
         pyramid: &mut Pyramid,
         stack: &mut Stack,
+        stream: &mut Stream,
         part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
@@ -264,16 +267,18 @@ impl<S: Simd> Bvh<'_, S> {
             }
             going.starts_again();
             self.pyramid_goes_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
-            self.packets_go_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
+            self.rays_go_on(pyramid, stack, stream, &mut going, part, counter, &mut Forgetful);
             from = end;
         }
         going.free
     }
 
-    /// The same for up to 64 targets, in packets.
+    /// The same for up to 64 targets, ray by ray.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    pub(super) fn packets_from_root(
+    pub(super) fn rays_from_root(
         &self,
+        stream: &mut Stream,
         x: [f32; 3],
         targets: &Targets<'_>,
         first: usize,
@@ -281,40 +286,39 @@ impl<S: Simd> Bvh<'_, S> {
         part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
-        let (start, ask) = (Start::ROOT, u64::MAX);
-        self.packets_blocked(&start, x, targets, first, count, ask, part, counter, &mut Forgetful)
+        let ask = u64::MAX >> (64 - count);
+        self.rays_blocked(stream, &Start::ROOT, x, targets, first, ask, part, counter, &mut Forgetful)
     }
 
-    /// The same for those of `ask` of up to 64 targets, in packets.
+    /// The same for those of `ask` of the 64 targets from the `first`th on.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    pub(super) fn packets_blocked(
+    pub(super) fn rays_blocked(
         &self,
+        stream: &mut Stream,
         start: &Start<'_>,
         x: [f32; 3],
         targets: &Targets<'_>,
         first: usize,
-        count: usize,
         ask: u64,
         part: impl Part,
         counter: &mut impl Counter,
         learner: &mut impl Learner,
     ) -> u64 {
         let token = self.simd.token();
-        let width = S::Packet::WIDTH;
-        let mut blocked = 0;
+        counter.rays(ask.count_ones());
+        stream.clear();
         let mut tail = [0.0; 16];
-        let mut done = 0;
-        while done < count {
-            let (from, rest) = (first + done, (count - done).min(width));
-            let active = (ask >> done) as u32 & ((1 << rest) - 1);
+        let mut from = 0;
+        while from < MOST {
+            let active = (ask >> from) as u32 & ((1 << S::Packet::WIDTH) - 1);
             if active != 0 {
-                counter.rays(active.count_ones());
                 let origin = vec3x::splat(token, x);
+                let (at, rest) = (first + from, (32 - active.leading_zeros()) as usize);
                 let ends = [
-                    ends_of::<S>(token, targets.x, from, rest, &mut tail),
-                    ends_of::<S>(token, targets.y, from, rest, &mut tail),
-                    ends_of::<S>(token, targets.z, from, rest, &mut tail),
+                    ends_of::<S>(token, targets.x, at, rest, &mut tail),
+                    ends_of::<S>(token, targets.y, at, rest, &mut tail),
+                    ends_of::<S>(token, targets.z, at, rest, &mut tail),
                 ];
                 let rays = Rays {
                     origin,
@@ -322,13 +326,11 @@ impl<S: Simd> Bvh<'_, S> {
                     t_min: S::Packet::splat(token, 0.0),
                     t_max: S::Packet::splat(token, 1.0),
                 };
-                let mut any = Any { blocked: 0, note: Learn(learner) };
-                self.traverse_rays(start, &rays, active, part, counter, &mut any);
-                blocked |= u64::from(any.blocked) << done;
+                self.join(stream, from, &rays, active);
             }
-            done += width;
+            from += S::Packet::WIDTH;
         }
-        blocked
+        self.stream_blocked(stream, start, ask, part, counter, learner)
     }
 }
 

@@ -30,6 +30,7 @@ mod shaft;
 mod single;
 mod slabs;
 mod small;
+mod stream;
 mod tile;
 
 pub use batch::{BatchScratch, Targets};

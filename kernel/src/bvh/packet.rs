@@ -209,14 +209,14 @@ impl Ends {
 
 /// As many rays of a packet or fewer meet all boxes of a node one by one: more of them meet the boxes one by one, all at
 /// once.
-const FEW_AT_NODE: u32 = 6;
+pub(super) const FEW_AT_NODE: u32 = 6;
 
 /// The same with the triangles of a block, of which there are fewer.
-const FEW_AT_BLOCK: u32 = 3;
+pub(super) const FEW_AT_BLOCK: u32 = 3;
 
 /// The 8 by 8 bits of a word, rows as columns.
 #[inline(always)]
-fn transposed(x: u64) -> u64 {
+pub(super) fn transposed(x: u64) -> u64 {
     let t = (x ^ (x >> 7)) & 0x00aa_00aa_00aa_00aa;
     let x = x ^ t ^ (t << 7);
     let t = (x ^ (x >> 14)) & 0x0000_cccc_0000_cccc;
@@ -329,14 +329,13 @@ impl<S: Simd> Bvh<'_, S> {
             t_min: S::Packet::load(token, &rays.t_min[from..]),
             t_max: S::Packet::load(token, &rays.t_max[from..]),
         };
-        self.traverse_rays(&Start::ROOT, &chunk, active, ignore, counter, visitor);
+        self.traverse_rays(&chunk, active, ignore, counter, visitor);
     }
 
     /// Asks about the rays of `active`.
     #[inline(always)]
     pub(super) fn traverse_rays<V: PacketVisitor<S::Packet>>(
         &self,
-        start: &Start<'_>,
         rays: &Rays<S::Packet>,
         active: u32,
         part: impl Part,
@@ -346,7 +345,7 @@ impl<S: Simd> Bvh<'_, S> {
         if !self.nodes.is_empty() {
             self.simd.apart(
                 #[inline(always)]
-                || self.traverse_axes(start, rays, active, part, counter, visitor),
+                || self.traverse_axes(rays, active, part, counter, visitor),
             );
         }
     }
@@ -354,7 +353,6 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     fn traverse_axes<V: PacketVisitor<S::Packet>>(
         &self,
-        start: &Start<'_>,
         rays: &Rays<S::Packet>,
         active: u32,
         part: impl Part,
@@ -389,21 +387,16 @@ impl<S: Simd> Bvh<'_, S> {
             Turn::Each([first, second])
         };
 
-        let slabs = if start.has_boxes() {
-            let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
-            let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
-            PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack)
-        } else {
-            PacketSlabs::nothing(token)
-        };
-        self.traverse_packet(start, rays, &slabs, turn, along, part, counter, visitor);
+        let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
+        let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
+        let slabs = PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
+        self.traverse_packet(rays, &slabs, turn, along, part, counter, visitor);
     }
 
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn traverse_packet<V: PacketVisitor<S::Packet>>(
         &self,
-        start: &Start<'_>,
         rays: &Rays<S::Packet>,
         slabs: &PacketSlabs<S::Packet>,
         turn: Turn<S::Packet>,
@@ -421,28 +414,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut stack = ArrayVec::<(Child, u32, f32), STACK>::new();
         // Rays one by one, once they are wanted.
         let mut ends = None;
-        let mut k = 0;
-        while k < start.blocks.len() {
-            self.meet_block(&start.blocks[k], active, &mut this, part, counter, visitor);
-            if this.active == 0 {
-                return;
-            }
-            k += 1;
-        }
-        if start.root {
-            stack.push((Child::node(0), active, 0.0));
-        }
-        let mut k = 0;
-        while k < start.entries.len() {
-            let (child, _, may) = start.entries[k];
-            stack.push((child, (may >> start.shift) as u32 & active, 0.0));
-            k += 1;
-        }
-        let mut k = 0;
-        while k < start.nodes.len() {
-            self.meet_node::<V>(&start.nodes[k], this.active, slabs, &mut this, &mut stack, part, counter);
-            k += 1;
-        }
+        stack.push((Child::node(0), active, 0.0));
         while let Some((next, meet, _)) = stack.pop() {
             let meet = meet & this.active;
             if meet == 0 {
@@ -621,7 +593,7 @@ impl<S: Simd> Bvh<'_, S> {
         while left != 0 {
             let ray = left.trailing_zeros() as usize & 15;
             left &= left - 1;
-            let slabs = Slabs::<S::Node>::of_lane(token, &ends.slabs, ray, ends.t_min[ray]);
+            let slabs = Slabs::<S::Node>::of_lane(token, ends.slabs.each_ref(), ray, ends.t_min[ray]);
             let met = slabs.children(token, node, this.t_max[ray], &mut entry);
             any |= met;
             rows[ray / 8] |= u64::from(met) << (8 * (ray % 8));
@@ -647,26 +619,4 @@ struct Going<L: Lanes> {
     t_max: [f32; 16],
     /// Rays that want more.
     active: u32,
-}
-
-/// Where a traversal begins: at the root, or with some triangles and subtrees, as children of nodes made for it.
-pub(super) struct Start<'c> {
-    pub(super) root: bool,
-    pub(super) blocks: &'c [TriangleBlock],
-    pub(super) nodes: &'c [Node],
-    /// Subtrees, and which of all rays may meet them; the packet's are those from bit `shift` on.
-    pub(super) entries: &'c [(Child, f32, u64)],
-    pub(super) shift: usize,
-}
-
-impl Start<'_> {
-    /// Whether there are boxes to test and not only triangles.
-    #[inline(always)]
-    fn has_boxes(&self) -> bool {
-        self.root || !self.nodes.is_empty() || !self.entries.is_empty()
-    }
-
-    /// At the root.
-    pub(super) const ROOT: Start<'static> =
-        Start { root: true, blocks: &[], nodes: &[], entries: &[], shift: 0 };
 }

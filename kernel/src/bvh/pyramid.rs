@@ -18,7 +18,9 @@
 //!
 //! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by the same bound.
 
-use super::packet::{Any, Note, Rays, Start};
+use super::batch::BatchScratch;
+use super::packet::Rays;
+use super::stream::{Start, Stream};
 use super::{Bvh, Child, Node, Part, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
@@ -886,18 +888,18 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     pub(super) fn pyramid_blocked(
         &self,
-        pyramid: &mut Pyramid,
-        stack: &mut Stack,
+        scratch: &mut BatchScratch,
         part: impl Part,
         counter: &mut impl Counter,
     ) -> u64 {
+        let BatchScratch { pyramid, stack, stream } = scratch;
         let every = pyramid.every();
         counter.rays(pyramid.count as u32);
         stack.clear();
         stack.push((Child::node(0), 0.0, every));
         let mut going = Going::new(every);
         self.pyramid_goes_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
-        self.packets_go_on(pyramid, stack, &mut going, part, counter, &mut Forgetful);
+        self.rays_go_on(pyramid, stack, stream, &mut going, part, counter, &mut Forgetful);
         every & !going.free
     }
 
@@ -970,12 +972,14 @@ impl<S: Simd> Bvh<'_, S> {
         }
     }
 
-    /// The same with the rest of the stack, in packets.
+    /// The same with the rest of the stack, ray by ray.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    pub(super) fn packets_go_on(
+    pub(super) fn rays_go_on(
         &self,
         pyramid: &Pyramid,
         stack: &Stack,
+        stream: &mut Stream,
         going: &mut Going,
         part: impl Part,
         counter: &mut impl Counter,
@@ -985,27 +989,27 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         let token = self.simd.token();
-        let mut shift = 0;
-        while shift < pyramid.count {
-            let ask = (going.free >> shift) as u32 & ((1 << S::Packet::WIDTH) - 1);
+        stream.clear();
+        let mut from = 0;
+        while from < pyramid.count {
+            let ask = (going.free >> from) as u32 & ((1 << S::Packet::WIDTH) - 1);
             if ask != 0 {
                 let rays = Rays {
                     origin: vec3x::splat(token, pyramid.x.to_array()),
                     direction: [
-                        S::Packet::load(token, &pyramid.direction[0][shift..]),
-                        S::Packet::load(token, &pyramid.direction[1][shift..]),
-                        S::Packet::load(token, &pyramid.direction[2][shift..]),
+                        S::Packet::load(token, &pyramid.direction[0][from..]),
+                        S::Packet::load(token, &pyramid.direction[1][from..]),
+                        S::Packet::load(token, &pyramid.direction[2][from..]),
                     ],
                     t_min: S::Packet::splat(token, 0.0),
                     t_max: S::Packet::splat(token, 1.0),
                 };
-                let start = Start { root: false, blocks: &[], nodes: &[], entries: stack, shift };
-                let mut any = Any { blocked: 0, note: Learn(learner) };
-                self.traverse_rays(&start, &rays, ask, part, counter, &mut any);
-                going.free &= !(u64::from(any.blocked) << shift);
+                self.join(stream, from, &rays, ask);
             }
-            shift += S::Packet::WIDTH;
+            from += S::Packet::WIDTH;
         }
+        let start = Start { root: false, blocks: &[], nodes: &[], entries: stack };
+        going.free &= !self.stream_blocked(stream, &start, going.free, part, counter, learner);
     }
 
     /// Puts the children of a node that may block any of `ask` on the stack, the nearest on top.
@@ -1135,16 +1139,6 @@ impl Going {
 /// Hears of triangles that blocked something.
 pub(super) trait Learner {
     fn learn(&mut self, block: &TriangleBlock, lane: usize, blocked: u32);
-}
-
-/// Passes on what packets hit.
-pub(super) struct Learn<'l, L>(pub(super) &'l mut L);
-
-impl<L: Learner> Note for Learn<'_, L> {
-    #[inline(always)]
-    fn note(&mut self, bits: u32, block: &TriangleBlock, lane: usize) {
-        self.0.learn(block, lane, bits.count_ones());
-    }
 }
 
 /// Does not care.

@@ -215,12 +215,6 @@ impl Shaft {
         Plane::new(normal, -least, reference, 4.0 * position)
     }
 
-    /// How far from the points a box is, on the way to the targets, in no particular unit.
-    #[inline(always)]
-    pub(super) fn depth(&self, lower: Vec3, upper: Vec3) -> f32 {
-        ((lower + upper) * 0.5 - self.reference).dot(self.between)
-    }
-
     /// Which children of a node the shaft may meet.
     #[inline(always)]
     pub(super) fn children<S: Simd>(&self, simd: S, node: &Node) -> u32 {

@@ -77,8 +77,12 @@ impl<L: Lanes> Slabs<L> {
 
     /// One ray of a packet, from what [`PacketSlabs::store`] wrote.
     #[inline(always)]
-    pub(super) fn of_lane(token: L::Token, from: &[[[f32; 16]; 3]; 3], lane: usize, t_min: f32) -> Self {
-        let [inverse, near, far] = from;
+    pub(super) fn of_lane<const N: usize>(
+        token: L::Token,
+        [inverse, near, far]: [&[[f32; N]; 3]; 3],
+        lane: usize,
+        t_min: f32,
+    ) -> Self {
         Self {
             inverse: vec3x::broadcast(token, inverse, lane),
             near: vec3x::broadcast(token, near, lane),
@@ -139,13 +143,6 @@ pub(super) struct PacketSlabs<L> {
 }
 
 impl<L: Lanes> PacketSlabs<L> {
-    /// For packets that test no boxes.
-    #[inline(always)]
-    pub(super) fn nothing(token: L::Token) -> Self {
-        let zero = [L::splat(token, 0.0); 3];
-        Self { inverse: zero, near: zero, far: zero, t_min: zero[0], near_side: None }
-    }
-
     #[inline(always)]
     pub(super) fn new(
         token: L::Token,
@@ -189,6 +186,28 @@ impl<L: Lanes> PacketSlabs<L> {
             L::select(sound, back - wide, -infinity),
             L::select(sound, back + wide, infinity),
         )
+    }
+
+    /// From what [`PacketSlabs::constants`] gave.
+    #[inline(always)]
+    pub(super) fn from_constants(
+        [inverse, near, far]: [Vec3x<L>; 3],
+        t_min: L,
+        near_side: Option<[usize; 3]>,
+    ) -> Self {
+        Self { inverse, near, far, t_min, near_side }
+    }
+
+    /// The constants of each ray: inverse, near and far by axis.
+    #[inline(always)]
+    pub(super) fn constants(&self) -> [Vec3x<L>; 3] {
+        [self.inverse, self.near, self.far]
+    }
+
+    /// Which sides are near, by axis, if that is the same for all rays.
+    #[inline(always)]
+    pub(super) fn near_side(&self) -> Option<[usize; 3]> {
+        self.near_side
     }
 
     /// Writes the constants of each ray: inverse, near and far by axis.

@@ -10,10 +10,11 @@
 use super::abreast::{Abreast, Flat};
 use super::batch::{BatchScratch, FEW, targets_from};
 use super::occluders::Walls;
-use super::packet::{Any, Nobody, Rays, Start};
+use super::packet::Rays;
 use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft, Turned};
 use super::single::Place;
+use super::stream::{Start, Stream};
 use super::{Bvh, CUT, Child, Node, Occluders, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
@@ -229,18 +230,22 @@ impl Learner for List {
 
 /// Rays of several points, side by side.
 struct Packet {
-    origin: [[f32; 16]; 3],
-    direction: [[f32; 16]; 3],
-    target: [u32; 16],
+    origin: [[f32; MOST]; 3],
+    direction: [[f32; MOST]; 3],
+    target: [u32; MOST],
     count: usize,
 }
 
 impl Packet {
-    const EMPTY: Self = Self { origin: [[0.0; 16]; 3], direction: [[0.0; 16]; 3], target: [0; 16], count: 0 };
+    const EMPTY: Self =
+        Self { origin: [[0.0; MOST]; 3], direction: [[0.0; MOST]; 3], target: [0; MOST], count: 0 };
 }
 
 /// Points with fewer rays share packets with their neighbours, where there is no complete list.
 const MIXED: usize = 12;
+
+/// Points with as many or fewer share what the learned triangles leave open.
+const SHARED: usize = 32;
 
 /// With fewer rays a shaft costs more than it saves.
 const WORTHWHILE: usize = 32;
@@ -478,9 +483,11 @@ impl<S: Simd> Bvh<'_, S> {
                     continue;
                 }
             }
-            if packet.count == 0 && one_each(&points[k..], S::Packet::WIDTH) {
-                self.send_row(&points[k..], targets, cut, given, ignore, counter, blocked);
-                k += S::Packet::WIDTH;
+            let row = if packet.count == 0 { one_each(&points[k..]) } else { 0 };
+            if row >= S::Packet::WIDTH {
+                let row = &points[k..k + row];
+                self.send_row(&mut batch.stream, row, targets, cut, given, ignore, counter, blocked);
+                k += row.len();
                 continue;
             }
             let TilePoint { x, first, count } = points[k];
@@ -491,8 +498,17 @@ impl<S: Simd> Bvh<'_, S> {
                     let mut i = from;
                     while i < from + part {
                         packet.put(x, targets.get(i), i);
-                        if packet.count == S::Packet::WIDTH {
-                            self.send(packet, cut, given, ignore, counter, blocked);
+                        if packet.count == MOST {
+                            self.send(
+                                &mut batch.stream,
+                                packet,
+                                cut,
+                                given,
+                                ignore,
+                                counter,
+                                *learned,
+                                blocked,
+                            );
                         }
                         i += 1;
                     }
@@ -503,7 +519,7 @@ impl<S: Simd> Bvh<'_, S> {
                         let every = batch.pyramid.every();
                         every & !self.list_leaves(batch, given, every, false, ignore, counter)
                     } else {
-                        self.packets_from_root(x, targets, from, part, ignore, counter)
+                        self.rays_from_root(&mut batch.stream, x, targets, from, part, ignore, counter)
                     };
                     set(blocked, from, word);
                 } else {
@@ -526,19 +542,28 @@ impl<S: Simd> Bvh<'_, S> {
                             learned.fail();
                         }
                     }
-                    if ask != 0 {
-                        let start =
-                            Start { root: false, blocks: &[], nodes: cut.nodes(), entries: &[], shift: 0 };
-                        word |= self.packets_blocked(
+                    if part <= SHARED {
+                        while ask != 0 {
+                            let i = from + ask.trailing_zeros() as usize;
+                            ask &= ask - 1;
+                            packet.put(x, targets.get(i), i);
+                            if packet.count == MOST {
+                                let stream = &mut batch.stream;
+                                self.send(stream, packet, cut, given, ignore, counter, *learned, blocked);
+                            }
+                        }
+                    } else if ask != 0 {
+                        let start = Start { root: false, blocks: &[], nodes: cut.nodes(), entries: &[] };
+                        word |= self.rays_blocked(
+                            &mut batch.stream,
                             &start,
                             x,
                             targets,
                             from,
-                            part,
                             ask,
                             ignore,
                             counter,
-                            &mut **learned,
+                            *learned,
                         );
                     }
                     set(blocked, from, word);
@@ -548,7 +573,7 @@ impl<S: Simd> Bvh<'_, S> {
             k += 1;
         }
         if packet.count > 0 {
-            self.send(packet, cut, given, ignore, counter, blocked);
+            self.send(&mut batch.stream, packet, cut, given, ignore, counter, *learned, blocked);
         }
     }
 
@@ -595,11 +620,12 @@ impl<S: Simd> Bvh<'_, S> {
         going.free
     }
 
-    /// The rays of as many points as a packet holds, which have a target each, one after the other.
+    /// The rays of up to 64 points, which have a target each, one after the other.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn send_row(
         &self,
+        stream: &mut Stream,
         points: &[TilePoint],
         targets: &Targets<'_>,
         cut: &Cut,
@@ -609,53 +635,71 @@ impl<S: Simd> Bvh<'_, S> {
         blocked: &mut [u64],
     ) {
         let token = self.simd.token();
-        let mut lanes = [[0.0; 16]; 3];
-        let mut lane = 0;
-        while lane < S::Packet::WIDTH {
-            let [x, y, z] = points[lane].x;
-            (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (x, y, z);
-            lane += 1;
-        }
         let first = points[0].first as usize;
-        let origin = vec3x::load(token, &lanes, 0);
-        let rays = Rays {
-            origin,
-            direction: vec3x::sub(targets_from::<S>(token, targets, first, first + S::Packet::WIDTH), origin),
-            t_min: S::Packet::splat(token, 0.0),
-            t_max: S::Packet::splat(token, 1.0),
-        };
-        let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[], shift: 0 };
-        counter.rays(S::Packet::WIDTH as u32);
-        let mut any = Any { blocked: 0, note: Nobody };
-        self.traverse_rays(&start, &rays, (1 << S::Packet::WIDTH) - 1, ignore, counter, &mut any);
-        set(blocked, first, u64::from(any.blocked));
+        stream.clear();
+        let mut from = 0;
+        while from < points.len() {
+            let mut lanes = [[0.0; 16]; 3];
+            let mut lane = 0;
+            while lane < S::Packet::WIDTH {
+                // The last point once more in the lanes beyond it.
+                let [x, y, z] = points[(from + lane).min(points.len() - 1)].x;
+                (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (x, y, z);
+                lane += 1;
+            }
+            let origin = vec3x::load(token, &lanes, 0);
+            let ends = targets_from::<S>(token, targets, first + from, first + points.len());
+            let rays = Rays {
+                origin,
+                direction: vec3x::sub(ends, origin),
+                t_min: S::Packet::splat(token, 0.0),
+                t_max: S::Packet::splat(token, 1.0),
+            };
+            let active = u32::MAX >> (32 - (points.len() - from).min(S::Packet::WIDTH));
+            self.join(stream, from, &rays, active);
+            from += S::Packet::WIDTH;
+        }
+        let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[] };
+        counter.rays(points.len() as u32);
+        let ask = u64::MAX >> (64 - points.len());
+        let word = self.stream_blocked(stream, &start, ask, ignore, counter, &mut Forgetful);
+        set(blocked, first, word);
     }
 
-    /// The rays of a packet.
+    /// The rays that have been put together.
+    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn send(
         &self,
+        stream: &mut Stream,
         packet: &mut Packet,
         cut: &Cut,
         list: &List,
         ignore: Option<u32>,
         counter: &mut impl Counter,
+        learner: &mut impl Learner,
         blocked: &mut [u64],
     ) {
         let token = self.simd.token();
-        let rays = Rays {
-            origin: vec3x::load(token, &packet.origin, 0),
-            direction: vec3x::load(token, &packet.direction, 0),
-            t_min: S::Packet::splat(token, 0.0),
-            t_max: S::Packet::splat(token, 1.0),
-        };
-        let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[], shift: 0 };
+        stream.clear();
+        let mut from = 0;
+        while from < packet.count {
+            let rays = Rays {
+                origin: vec3x::load(token, &packet.origin, from),
+                direction: vec3x::load(token, &packet.direction, from),
+                t_min: S::Packet::splat(token, 0.0),
+                t_max: S::Packet::splat(token, 1.0),
+            };
+            let active = u32::MAX >> (32 - (packet.count - from).min(S::Packet::WIDTH));
+            self.join(stream, from, &rays, active);
+            from += S::Packet::WIDTH;
+        }
+        let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[] };
         counter.rays(packet.count as u32);
-        let mut any = Any { blocked: 0, note: Nobody };
-        self.traverse_rays(&start, &rays, (1 << packet.count) - 1, ignore, counter, &mut any);
-        let mut bits = any.blocked;
+        let ask = u64::MAX >> (64 - packet.count);
+        let mut bits = self.stream_blocked(stream, &start, ask, ignore, counter, learner);
         while bits != 0 {
-            let i = packet.target[bits.trailing_zeros() as usize & 15] as usize;
+            let i = packet.target[bits.trailing_zeros() as usize] as usize;
             bits &= bits - 1;
             blocked[i / 64] |= 1 << (i % 64);
         }
@@ -885,19 +929,20 @@ impl<S: Simd> Bvh<'_, S> {
         // A list that is not all there is would be asked for nothing as often as not.
         let (head, len) = saved;
         list.count = 0;
-        // The nearest come last, where a stack begins.
+        // The largest come first: they are likeliest to block many rays.
         let mut order = ArrayVec::<(f32, usize), CUT>::new();
         let mut k = head;
         while k < len {
             let [lower, upper] = cut.queue[k].bounds;
-            let depth = shaft.depth(Vec3::from(lower), Vec3::from(upper));
+            let d = Vec3::from(upper) - Vec3::from(lower);
+            let size = d.x * d.y + d.y * d.z + d.z * d.x;
             let mut slot = order.len();
-            order.push((depth, k));
-            while slot > 0 && order[slot - 1].0 < depth {
+            order.push((size, k));
+            while slot > 0 && order[slot - 1].0 < size {
                 order[slot] = order[slot - 1];
                 slot -= 1;
             }
-            order[slot] = (depth, k);
+            order[slot] = (size, k);
             k += 1;
         }
         let mut k = 0;
@@ -940,7 +985,7 @@ impl List {
 impl Packet {
     #[inline(always)]
     fn put(&mut self, x: [f32; 3], target: Vec3, index: usize) {
-        let lane = self.count & 15;
+        let lane = self.count % MOST;
         let target_at = target.to_array();
         let mut axis = 0;
         while axis < 3 {
@@ -997,17 +1042,15 @@ fn run(points: &[TilePoint], k: &mut usize) -> (usize, usize) {
     (first as usize, end as usize)
 }
 
-/// Have the first `count` points a target each, one after the other?
+/// How many of the first points, up to 64, have a target each, one after the other?
 #[inline(always)]
-fn one_each(points: &[TilePoint], count: usize) -> bool {
-    if points.len() < count {
-        return false;
-    }
+fn one_each(points: &[TilePoint]) -> usize {
+    let most = points.len().min(MOST);
     let mut k = 0;
-    while k < count && points[k].count == 1 && points[k].first == points[0].first + k as u32 {
+    while k < most && points[k].count == 1 && points[k].first == points[0].first + k as u32 {
         k += 1;
     }
-    k == count
+    k
 }
 
 /// How many targets points have.
