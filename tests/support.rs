@@ -87,6 +87,8 @@ pub enum Family {
     Scalar,
     /// What the tests are compiled for.
     Native,
+    /// Sixteen lanes a packet, whatever the CPU's registers hold.
+    Sixteen,
     /// Chosen at run time.
     Level(Level),
 }
@@ -94,7 +96,7 @@ pub enum Family {
 impl Family {
     /// All of them.
     pub fn all() -> Vec<Self> {
-        [Self::Scalar, Self::Native].into_iter().chain(lanes::levels().map(Self::Level)).collect()
+        [Self::Scalar, Self::Native, Self::Sixteen].into_iter().chain(lanes::levels().map(Self::Level)).collect()
     }
 
     /// The fastest.
@@ -107,6 +109,7 @@ impl Family {
         match self {
             Self::Scalar => task.run(Scalar),
             Self::Native => task.run(Native),
+            Self::Sixteen => task.run(Sixteen),
             Self::Level(level) => lanes::dispatch(level, task),
         }
     }
@@ -117,8 +120,25 @@ impl fmt::Display for Family {
         match self {
             Self::Scalar => f.write_str("scalar"),
             Self::Native => f.write_str("native"),
+            Self::Sixteen => f.write_str("sixteen"),
             Self::Level(level) => f.write_str(lanes::level_name(*level)),
         }
+    }
+}
+
+/// The vectors of [`Family::Sixteen`].
+#[derive(Clone, Copy, Debug)]
+pub struct Sixteen;
+
+impl Simd for Sixteen {
+    type Token = ();
+    type Node = wide::f32x8;
+    type Packet = wide::f32x16;
+
+    fn token(self) {}
+
+    fn apart<R>(self, work: impl FnOnce() -> R) -> R {
+        work()
     }
 }
 
