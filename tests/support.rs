@@ -96,7 +96,10 @@ pub enum Family {
 impl Family {
     /// All of them.
     pub fn all() -> Vec<Self> {
-        [Self::Scalar, Self::Native, Self::Sixteen].into_iter().chain(lanes::levels().map(Self::Level)).collect()
+        [Self::Scalar, Self::Native, Self::Sixteen]
+            .into_iter()
+            .chain(lanes::levels().map(Self::Level))
+            .collect()
     }
 
     /// The fastest.

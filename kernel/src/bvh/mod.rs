@@ -11,8 +11,8 @@
 //!
 //! Which to use: for shadows, the tile wherever points come in neighbourhoods (about 8 by 8 pixels or texels at several
 //! samples a light, 16 by 16 at one, best in the order of a Z curve); the batch for a point by itself with four samples
-//! or more; packets for other rays that start and end near each other, camera rays above all; single rays for the rest,
-//! and for rays into hair or soups that share neither end.
+//! or more; packets for other rays, camera rays above all, of which some start and end near each other; single rays for
+//! the rest.
 //!
 //! Every one gives the answer of a loop over all triangles with the test of [`crate::triangle`]: boxes are
 //! widened by a bound on all rounding, of the box test as of the triangle test, so no hit is culled. One thing is

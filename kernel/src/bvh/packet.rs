@@ -1,4 +1,5 @@
-//! Several rays at a time, one a lane: one box or one triangle a step.
+//! Several rays at a time, one a lane: one box or one triangle a step, or, for the few rays that come to a place, each
+//! with all boxes or triangles there.
 
 use super::slabs::{PacketSlabs, SHORTEST, Slabs};
 use super::{Bvh, Child, Node, Part, STACK};
@@ -207,12 +208,12 @@ impl Ends {
     }
 }
 
-/// As many rays of a packet or fewer meet all boxes of a node one by one: more of them meet the boxes one by one, all at
-/// once.
-pub(super) const FEW_AT_NODE: u32 = 6;
+/// Of as many rays of a vector or fewer, each is tested against all boxes of a node; more are tested side by side against
+/// one box after the other.
+pub(super) const FEW_AT_NODE: u32 = 4;
 
-/// The same with the triangles of a block, of which there are fewer.
-pub(super) const FEW_AT_BLOCK: u32 = 3;
+/// The same with the triangles of a block.
+pub(super) const FEW_AT_BLOCK: u32 = 4;
 
 /// The 8 by 8 bits of a word, rows as columns.
 #[inline(always)]

@@ -4,8 +4,8 @@
 //! is visible; or a sheet of triangles stands across it ([`super::cover`]), and none is. Else it yields the few triangles
 //! there are, side by side in blocks of their own, or, where they are many, the subtrees to begin with. Long lists and
 //! subtrees are cut down by narrower shafts for parts of the points. Then the points are asked: abreast against a list
-//! ([`super::abreast`]), or one by one from the subtrees on, where the triangles that blocked anything for one point are
-//! asked first for the next.
+//! ([`super::abreast`]), or from the subtrees on, up to 64 rays together ([`super::stream`]), where the triangles that
+//! blocked anything for one point are asked first for the next.
 
 use super::abreast::{Abreast, Flat};
 use super::batch::{BatchScratch, FEW, targets_from};
@@ -34,7 +34,7 @@ pub struct TilePoint {
     pub count: u32,
 }
 
-/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About fifty kilobytes.
+/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About sixty kilobytes.
 pub struct TileScratch {
     batch: BatchScratch,
     cut: Cut,
@@ -241,7 +241,7 @@ impl Packet {
         Self { origin: [[0.0; MOST]; 3], direction: [[0.0; MOST]; 3], target: [0; MOST], count: 0 };
 }
 
-/// Points with fewer rays share packets with their neighbours, where there is no complete list.
+/// Points with fewer rays go down with their neighbours' from the start, where there is no complete list.
 const MIXED: usize = 12;
 
 /// Points with as many or fewer share what the learned triangles leave open.
