@@ -6,9 +6,10 @@
 
 use clap::{Args, Parser, Subcommand};
 use occlude_benches::learning::{Meeting, Place, Spent, Terms, meet, stay_alone};
+use occlude_benches::scaling::{self, Sample};
 use occlude_benches::whole::{Ladder, WAYS};
 use occlude_benches::{OWN, Peer, SHARED, Work, ours, scene};
-use occlude_host::generate::Kind;
+use occlude_host::generate::{Kind, generate};
 use occlude_kernel::lanes::{Level, detect, level_name, level_named};
 use std::fmt::Write as _;
 use std::path::{Path, PathBuf};
@@ -26,6 +27,8 @@ enum What {
     EqualError(EqualError),
     /// Whole renders, until the error of the picture is small.
     Whole(Whole),
+    /// Visibility at equal error from 10^3 triangles on, and the map's memory against what it may have.
+    Scaling(Scaling),
 }
 
 /// What all of them want to know.
@@ -36,12 +39,12 @@ struct Common {
     #[arg(long, value_delimiter = ',')]
     scenes: Vec<String>,
     /// The picture's size in pixels.
-    #[arg(long, value_name = "WxH", value_parser = size, default_value = "160x90")]
+    #[arg(long, value_name = "WxH", value_parser = size, default_value = "128x72")]
     size: (u32, u32),
     /// The SIMD level.
     #[arg(long, value_parser = level)]
     simd: Option<Level>,
-    /// Write NAME.csv and NAME.md.
+    /// Write NAME.csv and NAME.md; of scaling NAME.svg as well.
     #[arg(short, long, value_name = "NAME")]
     output: Option<PathBuf>,
 }
@@ -59,6 +62,21 @@ struct EqualError {
     /// Renders with other random numbers, which are added up.
     #[arg(long, default_value_t = 1)]
     seeds: u64,
+}
+
+#[derive(Args)]
+struct Scaling {
+    #[command(flatten)]
+    common: Common,
+    /// Shadow rays a camera sample, over all lights together.
+    #[arg(long, default_value_t = 64)]
+    rays: u32,
+    /// Up to 10^MOST triangles.
+    #[arg(long, default_value_t = 6, value_parser = clap::value_parser!(u32).range(3..=8))]
+    most: u32,
+    /// What the map may have, kB, of the scenes with 10^5 triangles.
+    #[arg(long, value_delimiter = ',', default_values_t = [64, 256, 1024, 4096, 262_144])]
+    memory: Vec<usize>,
 }
 
 #[derive(Args)]
@@ -80,7 +98,7 @@ fn size(text: &str) -> Result<(u32, u32), String> {
     text.split_once('x')
         .and_then(|(width, height)| Some((width.parse().ok()?, height.parse().ok()?)))
         .filter(|&(width, height)| width > 0 && height > 0)
-        .ok_or_else(|| "wants width x height in pixels, like 160x90".to_owned())
+        .ok_or_else(|| "wants width x height in pixels, like 128x72".to_owned())
 }
 
 fn level(name: &str) -> Result<Level, String> {
@@ -127,6 +145,7 @@ fn main() {
     match Options::parse().what {
         What::EqualError(options) => equal_error(&options),
         What::Whole(options) => whole(&options),
+        What::Scaling(options) => scale(&options),
     }
 }
 
@@ -227,6 +246,9 @@ fn equal_error_csv(meetings: &[Meeting]) -> String {
     text
 }
 
+/// What a meeting is summed up by.
+type Figure = fn(&Meeting) -> f64;
+
 fn equal_error_markdown(options: &EqualError, meetings: &[Meeting]) -> String {
     let (width, height) = options.common.size;
     let mut text = format!(
@@ -275,12 +297,12 @@ fn equal_error_markdown(options: &EqualError, meetings: &[Meeting]) -> String {
                 meeting.map_bytes as f64 * 1e-3,
             );
         }
-        let figures: [(&str, &dyn Fn(&Meeting) -> f64); 5] = [
-            ("gain of visibility", &|meeting| meeting.gain(Spent::of_visibility)),
-            ("with light samples", &|meeting| meeting.gain(Spent::of_light)),
-            ("of the whole", &|meeting| meeting.gain(Spent::whole)),
-            ("lead over Embree", &Meeting::lead),
-            ("with light samples", &Meeting::lead_with_samples),
+        let figures: [(&str, Figure); 5] = [
+            ("gain of visibility", |meeting| meeting.gain(Spent::of_visibility)),
+            ("with light samples", |meeting| meeting.gain(Spent::of_light)),
+            ("of the whole", |meeting| meeting.gain(Spent::whole)),
+            ("lead over Embree", Meeting::lead),
+            ("with light samples", Meeting::lead_with_samples),
         ];
         text.push('\n');
         for (name, figure) in figures {
@@ -380,6 +402,110 @@ fn whole_markdown(options: &Whole, all: &[Climbs]) -> String {
         let gains = all.iter().map(|climbs| (climbs.scene.as_str(), climbs.gain(over)));
         let (mean, least, of) = mean_and_least(gains);
         let _ = writeln!(text, "- over {name}: geometric mean {mean:.2}, least {least:.2} ({of})");
+    }
+    text
+}
+
+/// Triangles of the scenes in which the map's memory is bounded.
+const BOUNDED: usize = 100_000;
+
+fn scale(options: &Scaling) {
+    let Scaling { common, rays, most, memory } = options;
+    let level = common.level();
+    let kinds = [Kind::Spheres, Kind::City]
+        .into_iter()
+        .filter(|kind| common.scenes.is_empty() || common.scenes.iter().any(|name| name == kind.name()));
+    let (mut meetings, mut bounded) = (Vec::new(), Vec::new());
+    for kind in kinds {
+        for power in 3..=*most {
+            let triangles = 10usize.pow(power);
+            let Some(place) = Place::new(kind.name(), generate(kind, 1, triangles), common.size) else {
+                continue;
+            };
+            let terms = Terms::new(level, *rays);
+            let meeting = meet(&place, &terms, &[]);
+            eprintln!(
+                "{:>16}, {} triangles: gain {:.3}, ns a ray: exact {:.2}, auto {:.2}",
+                place.name,
+                meeting.triangles,
+                meeting.gain(Spent::of_visibility),
+                meeting.exact_ns(),
+                meeting.effective_ns()
+            );
+            meetings.push(meeting);
+            if triangles == BOUNDED {
+                for &most in memory {
+                    let terms = Terms { memory: Some(most << 10), ..terms };
+                    bounded.push((most, meet(&place, &terms, &[])));
+                }
+            }
+        }
+    }
+    let samples: Vec<_> = meetings
+        .iter()
+        .flat_map(|meeting| {
+            let each = [("exact", meeting.exact_ns()), ("auto", meeting.effective_ns())];
+            each.map(|(peer, ns)| Sample {
+                kind: meeting.scene.clone(),
+                peer,
+                triangles: meeting.triangles,
+                ns,
+                build: f64::NAN,
+                bytes: f64::NAN,
+            })
+        })
+        .collect();
+    let markdown = scaling_markdown(options, &meetings, &bounded);
+    print!("{markdown}");
+    common.write(&equal_error_csv(&meetings), &markdown);
+    if let Some(name) = &common.output {
+        let title =
+            format!("Visibility, {rays} shadow rays, one thread: time for each ray of exact at equal error");
+        write(&name.with_extension("svg"), &scaling::svg(&samples, &title));
+    }
+}
+
+fn scaling_markdown(options: &Scaling, meetings: &[Meeting], bounded: &[(usize, Meeting)]) -> String {
+    let (width, height) = options.common.size;
+    let passes = meetings.first().map_or(0, |meeting| meeting.passes);
+    let mut text = format!(
+        "{width}x{height} pixels, {} shadow rays, {passes} passes, SIMD level `{}`. Seconds of visibility, for auto with \
+         lessons and times the ratio of squared errors: what exact has in all passes, and what auto needs to come to the \
+         same error.\n\n\
+         | scene | triangles | exact, s | auto, s | squared error | gain: visibility | with light samples | whole | map, kB |\n\
+         | --- | ---: | ---: | ---: | ---: | ---: | ---: | ---: | ---: |\n",
+        options.rays,
+        level_name(options.common.level()),
+    );
+    for meeting in meetings {
+        let _ = writeln!(
+            text,
+            "| {} | {} | {:.3} | {:.3} | {:.2} | {:.2} | {:.2} | {:.2} | {:.0} |",
+            meeting.scene,
+            meeting.triangles,
+            meeting.exact.visibility,
+            meeting.auto.of_visibility() * meeting.error_ratio(),
+            meeting.error_ratio(),
+            meeting.gain(Spent::of_visibility),
+            meeting.gain(Spent::of_light),
+            meeting.gain(Spent::whole),
+            meeting.map_bytes as f64 * 1e-3,
+        );
+    }
+    text.push_str(
+        "\n| scene, 10^5 triangles | the map may have, KiB | and has, KiB | squared error | gain: visibility | whole |\n\
+         | --- | ---: | ---: | ---: | ---: | ---: |\n",
+    );
+    for (most, meeting) in bounded {
+        let _ = writeln!(
+            text,
+            "| {} | {most} | {:.0} | {:.2} | {:.2} | {:.2} |",
+            meeting.scene,
+            meeting.map_bytes as f64 / 1024.0,
+            meeting.error_ratio(),
+            meeting.gain(Spent::of_visibility),
+            meeting.gain(Spent::whole),
+        );
     }
     text
 }
