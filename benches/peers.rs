@@ -9,7 +9,7 @@ use clap::Parser;
 use occlude_benches::ours::{METHODS, Method};
 use occlude_benches::record::{Cell, Record, SceneRow};
 use occlude_benches::scaling::{self, Sample};
-use occlude_benches::{Class, OWN, SHARED, Setting, Work, median, obvhs, scene, thread_time};
+use occlude_benches::{Class, OWN, Peer, SHARED, Setting, Work, median, obvhs, scene, thread_time};
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::generate::{Kind, generate};
 use occlude_kernel::lanes::{Level, detect, level_name, level_named};
@@ -52,15 +52,6 @@ struct Options {
     /// Write NAME.csv and NAME.md.
     #[arg(short, long, value_name = "NAME")]
     output: Option<PathBuf>,
-}
-
-type Answer<'a> = Box<dyn Fn(&Work, &mut [u64]) + 'a>;
-
-/// Somebody who answers all of some work: a word a batch.
-struct Peer<'a> {
-    name: String,
-    family: &'static str,
-    answer: Answer<'a>,
 }
 
 fn main() {

@@ -17,6 +17,8 @@ use std::path::{Path, PathBuf};
 #[cfg(feature = "embree")]
 #[path = "support/embree.rs"]
 pub mod embree;
+#[path = "support/learning.rs"]
+pub mod learning;
 #[path = "support/obvhs.rs"]
 pub mod obvhs;
 #[path = "support/ours.rs"]
@@ -27,6 +29,8 @@ pub mod pack;
 pub mod record;
 #[path = "support/scaling.rs"]
 pub mod scaling;
+#[path = "support/whole.rs"]
+pub mod whole;
 
 /// What is asked: batches of shadow rays, each from a point to samples of a light.
 #[derive(Clone, Debug, Default)]
@@ -76,6 +80,19 @@ impl Work {
     pub fn answers(&self) -> Vec<u64> {
         vec![0; self.batches.len()]
     }
+}
+
+/// Answers all of some work: a word a batch, a bit a ray, 1 for blocked.
+pub type Answer<'a> = Box<dyn Fn(&Work, &mut [u64]) + 'a>;
+
+/// Somebody who answers.
+pub struct Peer<'a> {
+    /// What it is called.
+    pub name: String,
+    /// `ours`, `embree` or `obvhs`.
+    pub family: &'static str,
+    /// How it answers.
+    pub answer: Answer<'a>,
 }
 
 /// How much of a light a point sees, by 64 exact rays.

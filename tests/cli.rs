@@ -366,6 +366,18 @@ fn the_map_that_learns_renders_and_is_compared() {
         assert!(row["gain_visibility"].parse::<f64>().expect("a number") > 0.0);
     }
     assert_eq!(rows(&page.join("passes.csv")).len(), 4 * 3, "after 1, 2 and 3 passes");
+    assert_eq!(rows(&page.join("classes.csv")).len(), 4 * 3, "lit, dark and penumbra");
+    let guard = rows(&page.join("guard.csv"));
+    assert_eq!(guard.len(), 3);
+    for row in &guard {
+        let part = |name: &str| row[name].parse::<f64>().expect("a number");
+        assert!(
+            part("gamma") >= 0.0 && part("gain_measured") > 0.0 && part("gain_promised") > 0.0,
+            "{row:?}"
+        );
+        // Not numbers until some cell has odds.
+        assert!(["q", "r2", "m"].iter().all(|name| !(part(name) < 0.0 || part(name) > 1.0)), "{row:?}");
+    }
     let html = String::from_utf8(std::fs::read(page.join("index.html")).expect("the page")).expect("text");
     roxmltree::Document::parse_with_options(
         &html,

@@ -7,7 +7,7 @@ use std::fmt::Write as _;
 pub struct Sample {
     /// The kind of scene.
     pub kind: String,
-    /// Who answered: `ours` or `embree`.
+    /// Who answered: `ours` or `embree`, `exact` or `auto`. The first one's lines are drawn solid.
     pub peer: &'static str,
     /// Triangles of the scene.
     pub triangles: usize,
@@ -99,7 +99,11 @@ pub fn svg(samples: &[Sample], title: &str) -> String {
     for (kind, peer) in lines {
         let colour = ["#c0392b", "#1f5fa8", "#2e7d32", "#7b4fa3"]
             [kinds.iter().position(|k| *k == kind).unwrap_or(0) % 4];
-        let dash = if peer == "ours" { "" } else { " stroke-dasharray=\"6 4\"" };
+        let dash = if samples.first().is_some_and(|first| first.peer == peer) {
+            ""
+        } else {
+            " stroke-dasharray=\"6 4\""
+        };
         let (mut path, mut last) = (String::new(), (0.0, 0.0));
         for sample in samples.iter().filter(|sample| sample.kind == kind && sample.peer == peer) {
             last = (x_at(sample.triangles as f64), y_at(sample.ns));

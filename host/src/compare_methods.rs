@@ -1,10 +1,10 @@
 //! Methods beside each other: the same camera samples, their errors, and the time they take.
 
 use crate::clock;
-use crate::film::{Film, Image};
+use crate::film::{Film, Image, Tile};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, Learned, MapOptions, PreparedMap, Scratch, Settings, Stage, StageTimes,
-    Stochastic, Visibility, render_tile,
+    Auto, AutoOptions, CameraSample, Exact, Learned, MapOptions, PreparedMap, Questions, Scratch, Settings,
+    Stage, StageTimes, Stochastic, Visibility, render_samples, render_tile,
 };
 use crate::metrics::flip;
 use crate::page::{
@@ -12,15 +12,18 @@ use crate::page::{
 };
 use crate::reproduce::{Halted, Reproduced, Run};
 use clap::ValueEnum;
+use occlude_kernel::Counts;
+use occlude_kernel::occlusion_map::{BINS, CLASSES, class};
 use rayon::prelude::*;
 use std::sync::Mutex;
+use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::Instant;
 
 /// The command that makes the page.
 pub const MAKER: &str = "occlude compare-methods";
 
 /// The files beside the page.
-pub const FILES: [&str; 3] = ["methods.csv", "passes.csv", "learned.csv"];
+pub const FILES: [&str; 5] = ["methods.csv", "passes.csv", "classes.csv", "learned.csv", "guard.csv"];
 
 /// A way to find visibility.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, ValueEnum)]
@@ -59,15 +62,50 @@ pub struct Comparison {
     pub size: (u32, u32),
 }
 
+/// A method, and how many shadow rays it has asked about.
+struct Watched<'a> {
+    visibility: Box<dyn Visibility + 'a>,
+    rays: AtomicU64,
+}
+
+impl Visibility for Watched<'_> {
+    fn begin(&self, stage: &Stage<'_>, tiles: &[Tile], width: u32) {
+        self.visibility.begin(stage, tiles, width);
+    }
+
+    fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
+        self.visibility.ask(stage, scratch);
+    }
+
+    fn passed(&self, stage: &Stage<'_>) {
+        self.visibility.passed(stage);
+    }
+
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        self.rays.fetch_add(questions.weights.len() as u64, Ordering::Relaxed);
+        self.visibility.estimate(stage, questions, estimates, counts);
+    }
+}
+
 /// What a method has done so far.
 struct Runner<'a> {
     method: Method,
-    visibility: Box<dyn Visibility + 'a>,
+    visibility: Watched<'a>,
     film: Film,
     scratches: Vec<Mutex<Scratch>>,
     /// Before the first pass and in passes, s.
     seconds: f64,
     prepared: f64,
+    /// Between passes, s.
+    lessons: f64,
+    /// Light samples and visibility of each tile, s.
+    tiles: Vec<f64>,
     /// From time to time.
     history: Vec<Moment>,
 }
@@ -78,13 +116,20 @@ struct Moment {
     seconds: f64,
     error: f64,
     image: Image,
+    times: StageTimes,
+    /// Before the first pass and between passes, s.
+    learning: f64,
+    rays: u64,
 }
 
 impl<'a> Runner<'a> {
     fn new(method: Method, visibility: Box<dyn Visibility + 'a>, size: (u32, u32), prepared: f64) -> Self {
         let scratches = (0..rayon::current_num_threads()).map(|_| Mutex::default()).collect();
         let film = Film::new(size.0, size.1);
-        Self { method, visibility, film, scratches, seconds: prepared, prepared, history: Vec::new() }
+        let tiles = vec![0.0; film.tiles().len()];
+        let visibility = Watched { visibility, rays: AtomicU64::new(0) };
+        let (seconds, lessons, history) = (prepared, 0.0, Vec::new());
+        Self { method, visibility, film, scratches, seconds, prepared, lessons, tiles, history }
     }
 
     fn begin(&mut self, stage: &Stage<'_>) {
@@ -98,15 +143,48 @@ impl<'a> Runner<'a> {
 
     fn pass(&mut self, stage: &Stage<'_>, pass: u32) {
         let start = clock::of_process();
-        let Self { visibility, film, scratches, .. } = self;
+        let Self { visibility, film, scratches, tiles, .. } = self;
         let width = film.width();
-        film.tiles_mut().par_iter_mut().for_each(|tile| {
+        film.tiles_mut().par_iter_mut().zip(tiles).for_each(|(tile, seconds)| {
             let own = &scratches[rayon::current_thread_index().unwrap_or(0)];
             let mut scratch = own.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-            render_tile(stage, &**visibility, width, pass, tile, &mut scratch);
+            let before = asking(&scratch.times);
+            render_tile(stage, &*visibility, width, pass, tile, &mut scratch);
+            *seconds += asking(&scratch.times) - before;
         });
+        let passed = clock::of_process();
         visibility.passed(stage);
+        self.lessons += (clock::of_process() - passed).as_secs_f64();
         self.seconds += (clock::of_process() - start).as_secs_f64();
+    }
+
+    /// Light samples and visibility of one more pass over the pixels of a class, s: what it learns is not counted.
+    fn time_of(&self, stage: &Stage<'_>, pass: u32, which: impl Fn(usize) -> bool) -> f64 {
+        let (mut film, mut scratch) = (Film::new(self.film.width(), self.film.height()), Scratch::default());
+        let width = film.width();
+        for tile in film.tiles_mut() {
+            let pixels = tile.tile();
+            let counts = |&pixel: &u32| {
+                let (x, y) = pixels.position(pixel as usize);
+                which((y * width + x) as usize)
+            };
+            let samples = (0..pixels.len() as u32).filter(counts);
+            let samples = samples.map(|pixel| CameraSample { pixel, index: pass });
+            render_samples(stage, &self.visibility, width, samples, tile, &mut scratch);
+        }
+        asking(&scratch.times)
+    }
+
+    fn remember(&mut self, passes: u32, error: f64, image: Image) {
+        self.history.push(Moment {
+            passes,
+            seconds: self.seconds,
+            error,
+            image,
+            times: self.times(),
+            learning: self.prepared + self.lessons,
+            rays: self.visibility.rays.load(Ordering::Relaxed),
+        });
     }
 
     fn times(&self) -> StageTimes {
@@ -118,6 +196,11 @@ impl<'a> Runner<'a> {
     }
 }
 
+/// Light samples and visibility, s.
+fn asking(times: &StageTimes) -> f64 {
+    (times.light + times.visibility).as_secs_f64()
+}
+
 /// What the exact method says of a pixel.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
 enum Class {
@@ -127,7 +210,7 @@ enum Class {
     Empty,
 }
 
-const CLASSES: [(Class, &str); 3] =
+const CLASSES_OF_PIXELS: [(Class, &str); 3] =
     [(Class::Lit, "lit"), (Class::Dark, "dark"), (Class::Penumbra, "penumbra")];
 
 /// Pictures are kept of so many passes, and of the last.
@@ -184,6 +267,7 @@ fn compare(
 
     let many = Stage { shadow_rays: comparison.reference_rays, ..*stage };
     let mut reference = Runner::new(Method::Exact, Box::new(Exact), size, 0.0);
+    let mut insights = Vec::new();
     for pass in 0..comparison.passes {
         run.watch.reached(
             f64::from(pass) / f64::from(comparison.passes),
@@ -198,13 +282,16 @@ fn compare(
         let passes = pass + 1;
         if passes <= ALL_UNTIL || passes.is_power_of_two() || passes == comparison.passes {
             let truth = reference.film.develop();
+            if comparison.methods.contains(&Method::Auto) {
+                insights.push(Insight::of(&learner));
+            }
             for runner in &mut runners {
                 let image = runner.film.develop();
                 let error = rmse(&image, &truth, |_| true);
                 // Pictures of other passes are not shown.
                 let image =
                     if passes <= ALL_UNTIL || passes == comparison.passes { image } else { Image::default() };
-                runner.history.push(Moment { passes, seconds: runner.seconds, error, image });
+                runner.remember(passes, error, image);
             }
         }
     }
@@ -329,12 +416,13 @@ fn compare(
     let count = |class: Class| classes.iter().filter(|&&other| other == class).count();
     let share = |class: Class| 100.0 * count(class) as f64 / classes.len().max(1) as f64;
     let mut row = vec![Entry::from("pixels, %").tone(Tone::Faint)];
-    row.extend(CLASSES.map(|(class, _)| Entry::number(share(class), 3).tone(Tone::Faint)));
+    row.extend(CLASSES_OF_PIXELS.map(|(class, _)| Entry::number(share(class), 3).tone(Tone::Faint)));
     by_class.row(row);
     for (runner, image) in runners.iter().zip(&images) {
         let mut row = vec![Entry::from(runner.method.name())];
         row.extend(
-            CLASSES.map(|(class, _)| Entry::number(rmse(image, &truth, |pixel| classes[pixel] == class), 3)),
+            CLASSES_OF_PIXELS
+                .map(|(class, _)| Entry::number(rmse(image, &truth, |pixel| classes[pixel] == class), 3)),
         );
         by_class.row(row);
     }
@@ -347,7 +435,7 @@ fn compare(
         .numbers("penumbra");
     for (runner, image) in runners.iter().zip(&images).skip(1) {
         let mut row = vec![Entry::from(runner.method.name())];
-        row.extend(CLASSES.map(|(class, _)| {
+        row.extend(CLASSES_OF_PIXELS.map(|(class, _)| {
             let of = |image: &Image| rmse(image, &truth, |pixel| classes[pixel] == class).powi(2);
             Entry::number(of(image) / of(&images[0]), 3)
         }));
@@ -357,13 +445,17 @@ fn compare(
         page.add(&beside);
     }
 
+    let by_class = class_gains(&mut page, stage, comparison, &runners, &classes, &images, &truth);
+    costs(&mut page, comparison, &runners, &classes);
+
     let auto = comparison.methods.iter().position(|&method| method == Method::Auto);
-    let learned = match auto {
+    let (learned, guard) = match auto {
         Some(k) => {
             let gain = figures[0].0[0] * figures[0].1.powi(2) / (figures[k].0[0] * figures[k].1.powi(2));
-            learning(&mut page, stage, &learner, size, gain)
+            let learned = learning(&mut page, stage, &learner, size, gain, runners[k].prepared);
+            (learned, guarded(&mut page, &runners[0], &runners[k], &insights, &learner.history()))
         }
-        None => Data::new(&LEARNED),
+        None => (Data::new(&LEARNED), Data::new(&GUARD)),
     };
 
     page.section("Pictures");
@@ -410,7 +502,11 @@ fn compare(
         occlude_kernel::lanes::level_name(run.level),
         run.seed,
     );
-    Ok(Reproduced { page, foot, data: vec![(FILES[0], data), (FILES[1], passes), (FILES[2], learned)] })
+    Ok(Reproduced {
+        page,
+        foot,
+        data: FILES.into_iter().zip([data, passes, by_class, learned, guard]).collect(),
+    })
 }
 
 /// Pictures after the same time, and with the same error.
@@ -491,7 +587,14 @@ const LEARNED: [&str; 9] =
     ["passes", "cells", "lit", "odds", "left_alone", "part", "doubt", "promise", "asleep"];
 
 /// What the map that learns knew, and when.
-fn learning(page: &mut Page, stage: &Stage<'_>, auto: &Auto, size: (u32, u32), gain: f64) -> Data {
+fn learning(
+    page: &mut Page,
+    stage: &Stage<'_>,
+    auto: &Auto,
+    size: (u32, u32),
+    gain: f64,
+    prepared: f64,
+) -> Data {
     page.section("What the map knows");
     let history = auto.history();
     let mut data = Data::new(&LEARNED);
@@ -519,11 +622,12 @@ fn learning(page: &mut Page, stage: &Stage<'_>, auto: &Auto, size: (u32, u32), g
         );
     }
     page.add(&table);
-    page.data(FILES[2], "one line a lesson");
+    page.data(FILES[3], "one line a lesson");
     let promise = history.last().map_or(1.0, |lesson| lesson.promise);
     let slept = history.iter().find(|lesson| lesson.asleep);
     page.facts([
         ("memory of the map", format!("{:.1} MB", auto.bytes() as f64 / 1e6)),
+        ("building it, before the first pass", format!("{} s", number(prepared, 3))),
         ("gain of visibility, promised after the last lesson", number(promise, 3)),
         ("and measured, over all passes", number(gain, 3)),
         ("asleep", slept.map_or_else(|| "no".to_owned(), |lesson| format!("after pass {}", lesson.passes))),
@@ -560,6 +664,248 @@ fn learning(page: &mut Page, stage: &Stage<'_>, auto: &Auto, size: (u32, u32), g
     }
     page.add(&gallery);
     data
+}
+
+/// What the map knew after a pass, of its cells with odds, by the points in them.
+struct Insight {
+    /// The part of the variance of V that guesses explain, if they are right on average.
+    explained: f64,
+    /// Bins of a light that are in doubt, of [`BINS`].
+    doubtful: f64,
+    /// Samples asked for, of the usual ones.
+    part: f64,
+    /// How often a guess is wrong that looks certain.
+    missed: f64,
+}
+
+/// Bins of this class of doubt or a surer one are as good as certain: 4 p (1 - p) is below 2^-6.
+const CERTAIN: usize = 6;
+
+impl Insight {
+    fn of(auto: &Auto) -> Self {
+        let (mut all, mut explained, mut doubtful, mut part) = (0.0, 0.0, 0.0, 0.0);
+        let mut variance = 0.0;
+        auto.each_cell(|cell, points| {
+            if cell.is_lit() || !cell.is_known() {
+                return;
+            }
+            let points = f64::from(points);
+            let guesses = (0..BINS).map(|bin| f64::from(cell.odds(bin).guess()));
+            let mean = guesses.clone().sum::<f64>() / BINS as f64;
+            let spread = guesses.clone().map(|guess| (guess - mean).powi(2)).sum::<f64>() / BINS as f64;
+            let in_doubt = guesses.filter(|&guess| class(guess as f32) < CERTAIN).count();
+            all += points;
+            variance += points * mean * (1.0 - mean);
+            explained += points * spread;
+            doubtful += points * in_doubt as f64;
+            part += points * f64::from(cell.part());
+        });
+        let doubts = auto.doubts();
+        let (asked, squared) = (CERTAIN..CLASSES).fold((0.0, 0.0), |(asked, squared), class| {
+            let of_it = doubts.asked[class] as f64;
+            (asked + of_it, squared + of_it * doubts.variance(class))
+        });
+        Self {
+            explained: explained / variance,
+            doubtful: doubtful / all,
+            part: part / all,
+            missed: squared / asked,
+        }
+    }
+}
+
+const GUARD: [&str; 9] =
+    ["passes", "q", "bins_in_doubt", "m", "r2", "gamma", "r2_wanted", "gain_promised", "gain_measured"];
+
+/// What decides whether the map pays, and whether it did, over passes.
+fn guarded(
+    page: &mut Page,
+    first: &Runner<'_>,
+    auto: &Runner<'_>,
+    insights: &[Insight],
+    lessons: &[Learned],
+) -> Data {
+    let mut data = Data::new(&GUARD);
+    let mut rows = Vec::new();
+    let mut before = [0.0; 3];
+    for ((theirs, ours), insight) in first.history.iter().zip(&auto.history).zip(insights) {
+        let light = |moment: &Moment| moment.times.light.as_secs_f64();
+        let visibility = |moment: &Moment| moment.times.visibility.as_secs_f64();
+        // What the map itself costs: light samples beyond those that as many rays cost without it, and lessons.
+        let usual = light(theirs) * ours.rays as f64 / theirs.rays.max(1) as f64;
+        let now = [light(ours) - usual, ours.learning, visibility(theirs)];
+        let own = (now[0] - before[0]).max(0.0) + now[1] - before[1];
+        let gamma = own / (now[2] - before[2]);
+        before = now;
+        let promised = lessons.iter().rev().find(|lesson| lesson.passes <= ours.passes);
+        let promised = promised.map_or(f64::NAN, |lesson| lesson.promise);
+        let measured = visibility(theirs) * theirs.error.powi(2) / (visibility(ours) * ours.error.powi(2));
+        rows.push([
+            f64::from(ours.passes),
+            insight.part,
+            insight.doubtful,
+            insight.missed,
+            insight.explained,
+            gamma,
+            4.0 * gamma / (1.0 + gamma).powi(2),
+            promised,
+            measured,
+        ]);
+    }
+    for row in &rows {
+        let numbers = row[1..].iter().map(|value| format!("{value:.6e}"));
+        data.row(std::iter::once(row[0].to_string()).chain(numbers));
+    }
+    let curve = |column: usize| -> Vec<(f64, f64)> {
+        rows.iter().map(|row| (row[0], row[column])).filter(|(_, value)| value.is_finite()).collect()
+    };
+    page.add(
+        &Figure::new(
+            "Does the map pay?",
+            "R² is the part of the variance of visibility that guesses explain in cells with odds, γ what the map costs (lessons, \
+             and light samples beyond the usual ones) against exact visibility, pass by pass. It pays where R² is above \
+             4γ/(1 + γ)².",
+        )
+        .plot(
+            Plot::new("", Axis::linear("passes"), Axis::linear("part"))
+                .series(Series::new("R²", 0, curve(4)))
+                .series(Series::new("γ", 1, curve(5)))
+                .series(Series::new("4γ/(1 + γ)²", 2, curve(6)))
+                .series(Series::new("q, samples asked for", 3, curve(1))),
+        ),
+    );
+    page.add(
+        &Figure::new(
+            "Gain of visibility, promised and measured",
+            "Promised by the last lesson, for passes to come; measured over all passes so far.",
+        )
+        .plot(
+            Plot::new("", Axis::linear("passes"), Axis::linear("gain"))
+                .series(Series::new("promised", 0, curve(7)))
+                .series(Series::new("measured", 1, curve(8))),
+        ),
+    );
+    page.add(
+        &Figure::new(
+            "What is left in doubt",
+            format!("Bins of a light in doubt, of {BINS}, in cells with odds."),
+        )
+        .plot(Plot::new("", Axis::linear("passes"), Axis::linear("bins")).series(Series::new(
+            "in doubt",
+            0,
+            curve(2),
+        ))),
+    );
+    page.add(&Figure::new("Missed blockers", "m: how often a guess is wrong that looks certain.").plot(
+        Plot::new("", Axis::linear("passes"), Axis::log("m")).series(Series::new(
+            "m",
+            0,
+            curve(3).into_iter().filter(|point| point.1 > 0.0),
+        )),
+    ));
+    page.data(FILES[4], "one line a pass");
+    if let (Some(theirs), Some(ours)) = (first.history.last(), auto.history.last()) {
+        let traced = 100.0 * ours.rays as f64 / theirs.rays.max(1) as f64;
+        page.facts([
+            (
+                "shadow rays traced through the scene, of the first method's",
+                format!("{} %", number(traced, 3)),
+            ),
+            ("before the first pass and between passes", format!("{} s", number(ours.learning, 3))),
+        ]);
+    }
+    data
+}
+
+/// The gain of each class of pixels, by the time of one more pass over these alone.
+fn class_gains(
+    page: &mut Page,
+    stage: &Stage<'_>,
+    comparison: &Comparison,
+    runners: &[Runner<'_>],
+    classes: &[Class],
+    images: &[Image],
+    truth: &Image,
+) -> Data {
+    let mut data = Data::new(&["method", "class", "pixels", "seconds_a_pass", "rmse", "gain"]);
+    let mut table = Table::new("Gain by class, visibility and light samples")
+        .words("method")
+        .numbers("lit")
+        .numbers("dark")
+        .numbers("penumbra");
+    let product = |k: usize, class: Class| {
+        // In turns, so that whoever else uses the machine disturbs all alike; the least time is the least disturbed.
+        let time = (0..3)
+            .map(|pass| runners[k].time_of(stage, comparison.passes + pass, |pixel| classes[pixel] == class))
+            .fold(f64::INFINITY, f64::min);
+        (time, rmse(&images[k], truth, |pixel| classes[pixel] == class))
+    };
+    let first: Vec<_> = CLASSES_OF_PIXELS.map(|(class, _)| product(0, class)).into();
+    for (k, runner) in runners.iter().enumerate() {
+        let mut row = vec![Entry::from(runner.method.name())];
+        for (&(class, name), &(time, error)) in CLASSES_OF_PIXELS.iter().zip(&first) {
+            let (its_time, its_error) = if k == 0 { (time, error) } else { product(k, class) };
+            let gain = time * error * error / (its_time * its_error * its_error);
+            let tone = if gain >= 1.0 { Tone::Good } else { Tone::Bad };
+            row.push(if gain.is_finite() { Entry::number(gain, 3).tone(tone) } else { Entry::from("") });
+            let pixels = classes.iter().filter(|&&other| other == class).count();
+            data.row(
+                [runner.method.name().to_owned(), name.to_owned(), pixels.to_string()]
+                    .into_iter()
+                    .chain([its_time, its_error, gain].map(|value| format!("{value:.6e}"))),
+            );
+        }
+        table.row(row);
+    }
+    page.add(&table);
+    page.prose(
+        "Squared errors are of all passes; times of one more pass over the pixels of the class alone, after the last lesson. \
+         Where neither is ever wrong there is no gain to tell.",
+    );
+    page.data(FILES[2], "a line for each method and class");
+    data
+}
+
+/// Where the time goes, and what the classes are.
+fn costs(page: &mut Page, comparison: &Comparison, runners: &[Runner<'_>], classes: &[Class]) {
+    let (width, height) = comparison.size;
+    let passes = f64::from(comparison.passes);
+    let values: Vec<Vec<f64>> = runners
+        .iter()
+        .map(|runner| {
+            let mut values = vec![f64::NAN; width as usize * height as usize];
+            for (tile, seconds) in runner.film.tiles().iter().zip(&runner.tiles) {
+                let tile = tile.tile();
+                let each = seconds / (tile.len() as f64 * passes) * 1e6;
+                for (x, y) in (0..tile.len()).map(|pixel| tile.position(pixel)) {
+                    values[(y * width + x) as usize] = each;
+                }
+            }
+            values
+        })
+        .collect();
+    let most = values.iter().flatten().fold(1e-9f64, |most, &value| most.max(value));
+    let mut gallery = Gallery::new(
+        "Cost",
+        "Time of visibility and light samples, for a pixel and pass; by tiles, since questions are asked by tiles.",
+    )
+    .ramp(0.0, most, "µs");
+    for (runner, values) in runners.iter().zip(&values) {
+        let name = runner.method.name();
+        gallery.picture(name, Picture::new(&heat(values, width, height, 0.0, most), 0.0, name));
+    }
+    page.add(&gallery);
+    let shades = |class: Class| match class {
+        Class::Lit => [0.9, 0.8, 0.3],
+        Class::Dark => [0.02, 0.02, 0.1],
+        Class::Penumbra => [0.7, 0.1, 0.1],
+        Class::Empty => [0.2; 3],
+    };
+    let image = Image::from_fn(width, height, |x, y| shades(classes[(y * width + x) as usize]));
+    let mut gallery =
+        Gallery::new("Classes", "Yellow is lit, black is dark, red is penumbra, grey has no light to get.");
+    gallery.picture("by 64 exact rays to the lights", Picture::new(&image, 0.0, "classes of pixels"));
+    page.add(&gallery);
 }
 
 /// Over pixels and channels.

@@ -613,6 +613,17 @@ impl Auto {
         self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner()).history.clone()
     }
 
+    /// Shows every cell, with the points of the first look that are in it.
+    pub fn each_cell(&self, mut see: impl FnMut(&MapCell, u32)) {
+        let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        map.cells.iter().zip(&map.points).for_each(|(cell, &points)| see(cell, points));
+    }
+
+    /// How far guesses were off of late, by how sure they were.
+    pub fn doubts(&self) -> Doubts {
+        self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner()).doubts
+    }
+
     /// Bytes that the map takes.
     pub fn bytes(&self) -> usize {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
