@@ -602,11 +602,11 @@ impl<S: Simd> Bvh<'_, S> {
         let columns = [transposed(rows[0]), if S::Packet::WIDTH > 8 { transposed(rows[1]) } else { 0 }];
         while any != 0 {
             // The first child comes on top.
-            let place = 31 - any.leading_zeros() as usize & 7;
+            let place = (31 - any.leading_zeros()) as usize & 7;
             any &= !(1 << place);
             let child = node.children[place];
             if child != Child::NONE && part.below(child) {
-                let meet = columns[0] >> (8 * place) & 0xff | (columns[1] >> (8 * place) & 0xff) << 8;
+                let meet = (columns[0] >> (8 * place) & 0xff) | ((columns[1] >> (8 * place) & 0xff) << 8);
                 // Depth is checked at construction, so there is always room.
                 stack.push((child, meet as u32, 0.0));
             }

@@ -374,7 +374,7 @@ impl<S: Simd> Bvh<'_, S> {
                 while these != 0 {
                     let place = these.trailing_zeros() as usize & 7;
                     these &= these - 1;
-                    let met = columns[0] >> (8 * place) & 0xff | (columns[1] >> (8 * place) & 0xff) << 8;
+                    let met = (columns[0] >> (8 * place) & 0xff) | ((columns[1] >> (8 * place) & 0xff) << 8);
                     meets[place] |= met << from;
                 }
             } else {
@@ -393,7 +393,7 @@ impl<S: Simd> Bvh<'_, S> {
             }
         }
         while any != 0 {
-            let place = 31 - any.leading_zeros() as usize & 7;
+            let place = (31 - any.leading_zeros()) as usize & 7;
             any &= !(1 << place);
             let child = node.children[place];
             if child != Child::NONE && part.below(child) {
