@@ -64,6 +64,14 @@ impl AreaLight {
         }
     }
 
+    /// Is x so far from the light's plane that rounding does not matter to [`AreaLight::unshadowed`]? On the light
+    /// itself all of it or nothing may seem to be in sight.
+    #[inline]
+    pub fn is_apart(&self, x: Vec3) -> bool {
+        let reach = x.abs().max_element() + self.corner.abs().max_element();
+        self.normal.dot(x - self.corner) > 64.0 * f32::EPSILON * reach
+    }
+
     /// Irradiance of radiance 1 at x if nothing is in the way; `None` where not a ray of it can arrive: behind
     /// the light or below the surface's horizon. Never 0 otherwise, so that it may weigh a choice.
     #[inline]

@@ -5,33 +5,42 @@
 //! whole numbers, so that no order of threads matters, and between passes the counts become new odds.
 //!
 //! With odds, shadow rays go to the lights, and to the parts of a light, where there is doubt; no point gets more of them
-//! than it would without a map, on average. Cells in which that does not help are rendered as by the exact method, and
-//! when all are such, so is the whole picture: then the map sleeps, and costs nothing any more.
+//! than it would without a map, on average. Cells in which that does not help are left alone, and when all are such,
+//! the map sleeps, and costs nothing any more.
+//!
+//! Beside the map, each pixel remembers what it saw of each light ([`past`]). That takes the noise out of light that
+//! nothing blocks, shares a point's rays among its lights by their doubt, and among the bins of a light where a border
+//! crosses few of them.
 
+mod draws;
+mod past;
+mod prove;
 mod saved;
+mod seed;
 
 pub use saved::{SavedMap, fingerprint};
 
+use self::draws::{Bins, Draws};
+use self::past::{Nearby, Past, SURE_DOUBT};
+use self::prove::Prove;
 use self::saved::SavedCell;
-use super::{
-    CameraSample, Fan, NOBODY, Open, Questions, Scratch, ShadingPoint, Stage, Visibility, cast, exact,
-    expect, round, sample_lights,
-};
+use self::seed::Photons;
+use super::{Batch, CameraSample, NOBODY, Questions, Scratch, Stage, Visibility, cast, exact, expect, round};
 use crate::film::Tile;
-use crate::light::{AreaLight, Shape};
 use crate::photons::{BlockerSet, Shower};
 use crate::sampler::Sampler;
 use glam::Vec3;
-use occlude_kernel::lanes::{Task, dispatch};
+use occlude_kernel::lanes::dispatch;
 use occlude_kernel::occlusion_map::{
-    BIN_EDGE, BINS, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally, bin,
+    BINS, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally,
 };
-use occlude_kernel::{Bvh, Counts, Hit, Ray, Simd, Targets, TileScratch, Uncounted, offset};
+use occlude_kernel::{Counts, Ray, TileScratch, offset};
 use rayon::prelude::*;
+use std::collections::HashMap;
 use std::f32::consts::FRAC_1_PI;
-use std::ops::{ControlFlow, Range};
+use std::ops::Range;
 use std::sync::atomic::{AtomicU64, Ordering};
-use std::sync::{Mutex, RwLock};
+use std::sync::{Mutex, MutexGuard, RwLock};
 
 /// How the map is made.
 #[derive(Clone, Copy, Debug)]
@@ -40,7 +49,7 @@ pub struct AutoOptions {
     pub cell: f32,
     /// Photons to shoot before the first pass; if not given, some where a point has few shadow rays, and else none.
     pub photons: Option<u64>,
-    /// Bytes that cells may take.
+    /// Bytes that cells, and what pixels remember, may take.
     pub memory: usize,
 }
 
@@ -143,6 +152,12 @@ struct Map {
     full: bool,
     /// What was known after each lesson.
     history: Vec<Learned>,
+    /// By the first column and row of a tile: what its pixels have seen of each light.
+    pasts: HashMap<[u32; 2], Mutex<Vec<Past>>>,
+    /// Of how many lights there is room for that.
+    remembered: usize,
+    /// Bytes that are left for cells.
+    room: usize,
 }
 
 impl Default for Map {
@@ -165,6 +180,9 @@ impl Default for Map {
             ray: 4.0,
             full: false,
             history: Vec::new(),
+            pasts: HashMap::new(),
+            remembered: 0,
+            room: 0,
         }
     }
 }
@@ -189,7 +207,45 @@ const FEW: u32 = 8;
 /// Photons for each cell.
 const PHOTONS: u64 = 4;
 
+/// What is known of all lights of a point.
+#[derive(Default)]
+struct Told {
+    /// Whether that is anything.
+    changed: bool,
+    /// The greatest doubt.
+    most: f32,
+    /// Samples that lights are due by their doubt.
+    sum: f32,
+}
+
+/// What part of its shadow rays a point is worth where no light is in doubt; measured: a half and all are about as good.
+const SURE_RAYS: f32 = 1.0;
+
+/// A light in doubt gets no more than so many times the samples that its doubt is worth.
+const MOST_MORE: f32 = 8.0;
+
+fn lock(pasts: &Mutex<Vec<Past>>) -> MutexGuard<'_, Vec<Past>> {
+    pasts.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
+}
+
+/// What a pixel of a tile has seen of a light; of so many lights there is something to remember.
+#[inline(always)]
+fn past_of<'a>(
+    pasts: &'a mut Option<MutexGuard<'_, Vec<Past>>>,
+    pixel: u32,
+    light: u32,
+    lights: usize,
+) -> Option<&'a mut Past> {
+    let light = Some(light as usize).filter(|&light| light < lights)?;
+    pasts.as_mut()?.get_mut(pixel as usize * lights + light)
+}
+
 impl Map {
+    /// What the pixels of a tile have seen.
+    fn pasts_of(&self, place: [u32; 2]) -> Option<MutexGuard<'_, Vec<Past>>> {
+        self.pasts.get(&place).map(lock)
+    }
+
     fn view(&self) -> OcclusionMap<'_> {
         if self.table.is_empty() {
             return OcclusionMap::EMPTY;
@@ -214,8 +270,8 @@ impl Map {
     }
 
     /// Takes in what was learned before, as far as there is room.
-    fn remember(&mut self, saved: &SavedMap, options: &AutoOptions) {
-        let room = options.memory / CELL_BYTES;
+    fn remember(&mut self, saved: &SavedMap) {
+        let room = self.room / CELL_BYTES;
         self.full = saved.cells.len() > room;
         for SavedCell { cell, points, tallies } in saved.cells.iter().take(room) {
             self.cells.push(*cell);
@@ -234,7 +290,7 @@ impl Map {
     }
 
     /// Makes room for points that have none.
-    fn take_in(&mut self, mut strays: Vec<Stray>, stage: &Stage<'_>, options: &AutoOptions) {
+    fn take_in(&mut self, mut strays: Vec<Stray>, stage: &Stage<'_>) {
         strays.par_sort_unstable_by_key(Stray::order);
         let clearance = stage.bvh.clearance();
         let known = self.cells.len();
@@ -244,7 +300,7 @@ impl Map {
             let found = if self.table.is_empty() { None } else { self.view().find(key) };
             let index = match found {
                 Some(index) => index,
-                None if (self.cells.len() + 1) * CELL_BYTES > options.memory => {
+                None if (self.cells.len() + 1) * CELL_BYTES > self.room => {
                     self.full = true;
                     continue;
                 }
@@ -427,154 +483,10 @@ const PATIENCE: u32 = 8;
 
 /// A cell is left alone if its product of work and squared error is thought to be more than this part of the exact
 /// method's.
-const HOPELESS: f64 = 0.9;
+const HOPELESS: f64 = 0.75;
 
 /// And the whole picture if the map is thought to be no more than this many times better.
 const AWAKE: f64 = 1.05;
-
-/// Corners of the bins of a light.
-const CORNER_EDGE: usize = BIN_EDGE + 1;
-
-/// What the corners of the bins would send to a point if they were the whole light.
-#[inline(always)]
-fn corners(area: &AreaLight, point: &ShadingPoint) -> [f32; CORNER_EDGE * CORNER_EDGE] {
-    let whole = area.shape == Shape::Parallelogram;
-    let scale = area.area * FRAC_1_PI;
-    let mut grid = [0.0; CORNER_EDGE * CORNER_EDGE];
-    let mut column = 0;
-    while column < CORNER_EDGE {
-        let s = column as f32 / BIN_EDGE as f32;
-        let (start, step) = if whole {
-            (area.corner + area.u * s, area.v)
-        } else {
-            let root = s.sqrt();
-            (area.corner + area.u * (1.0 - root), area.v * root)
-        };
-        let (from, step) = (start - point.x, step * (1.0 / BIN_EDGE as f32));
-        let mut row = 0;
-        while row < CORNER_EDGE {
-            let path = from + step * row as f32;
-            let squared = path.length_squared();
-            let (leaving, arriving) = (-area.normal.dot(path), point.normal.dot(path));
-            let arrives = leaving > 0.0 && arriving > 0.0;
-            let weight = leaving / squared * (arriving / squared) * scale;
-            grid[row * CORNER_EDGE + column] = if arrives { weight } else { 0.0 };
-            row += 1;
-        }
-        column += 1;
-    }
-    grid
-}
-
-/// Samples of a light that follow a cell's density.
-struct Draws<'a> {
-    cell: &'a MapCell,
-    fan: &'a mut Fan,
-    /// Whether to look at what the corners of the bins would send; or else all send the same.
-    closely: bool,
-    /// What all of the light would send.
-    whole: f32,
-    area: &'a AreaLight,
-    point: &'a ShadingPoint,
-    square: &'a mut [[f32; 2]],
-    each: f32,
-    clearance: f32,
-}
-
-impl Task for Draws<'_> {
-    /// What is known of the whole light, and what the samples have of it.
-    type Output = [f32; 2];
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> [f32; 2] {
-        let Self { cell, fan, closely, whole, area, point, square, each, clearance } = self;
-        let count = square.len();
-        let mut i = 0;
-        while i < count {
-            let drawn = cell.draw(square[i]);
-            square[i] = drawn.at;
-            fan.densities[i] = drawn.density;
-            i += 1;
-        }
-        Open { fan: &mut *fan, area, point, square: &*square, each, clearance }.run(simd);
-        let (weights, bins, densities) =
-            (&mut fan.weights[..count], &fan.bins[..count], &fan.densities[..count]);
-        let (mut known, mut had) = (0.0, 0.0);
-        if closely {
-            let grid = corners(area, point);
-            let mut bin = 0;
-            while bin < BINS {
-                let at = bin / BIN_EDGE * CORNER_EDGE + bin % BIN_EDGE;
-                let four = grid[at] + grid[at + 1] + grid[at + CORNER_EDGE] + grid[at + CORNER_EDGE + 1];
-                known += cell.odds(bin).guess() * four;
-                bin += 1;
-            }
-            known *= 0.25 / BINS as f32;
-            i = 0;
-            while i < count {
-                let bin = usize::from(bins[i]) & (BINS - 1);
-                let (row, column) = (bin / BIN_EDGE, bin % BIN_EDGE);
-                let at = row * CORNER_EDGE + column;
-                let x = square[i][0] * BIN_EDGE as f32 - column as f32;
-                let y = square[i][1] * BIN_EDGE as f32 - row as f32;
-                let above = grid[at] + (grid[at + 1] - grid[at]) * x;
-                let below =
-                    grid[at + CORNER_EDGE] + (grid[at + CORNER_EDGE + 1] - grid[at + CORNER_EDGE]) * x;
-                let sends = above + (below - above) * y;
-                let one = 1.0 / densities[i];
-                had += cell.odds(bin).guess() * sends * one;
-                weights[i] *= one;
-                i += 1;
-            }
-            had *= each;
-        } else {
-            known = cell.mean() * whole;
-            i = 0;
-            while i < count {
-                let one = 1.0 / densities[i];
-                had += cell.odds(usize::from(bins[i]) & (BINS - 1)).guess() * one;
-                weights[i] *= one;
-                i += 1;
-            }
-            had *= each * whole;
-        }
-        [known, had]
-    }
-}
-
-/// Is there nothing between a cell and its light?
-struct Prove<'a> {
-    bvh: Bvh<'a>,
-    light: &'a AreaLight,
-    corners: &'a [[f32; 3]; 8],
-    scratch: &'a mut TileScratch,
-}
-
-impl Task for Prove<'_> {
-    type Output = bool;
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S) -> bool {
-        let clearance = self.bvh.clearance();
-        let (corners, count) = self.light.corners();
-        // Samples lie a clearance before the light, give or take some rounding.
-        let mut at = [[0.0; 8]; 3];
-        for (k, &corner) in corners[..count].iter().enumerate() {
-            for (half, by) in [0.75, 1.25].into_iter().enumerate() {
-                let target = offset(corner, self.light.normal, by * clearance);
-                for axis in 0..3 {
-                    at[axis][k + half * count] = target[axis];
-                }
-            }
-        }
-        let [x, y, z] = &at;
-        let Some(targets) = Targets::new(&x[..2 * count], &y[..2 * count], &z[..2 * count]) else {
-            return false;
-        };
-        let targets = targets.on_parallelogram(self.light.corner, self.light.u, self.light.v);
-        self.bvh.on(simd).nothing_between(self.corners, &targets, &mut Uncounted, self.scratch)
-    }
-}
 
 impl Auto {
     /// With nothing known yet.
@@ -627,7 +539,8 @@ impl Auto {
     /// Bytes that the map takes.
     pub fn bytes(&self) -> usize {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
-        map.cells.len() * CELL_BYTES + map.table.len() * size_of::<u32>()
+        let pixels: usize = map.pasts.values().map(|pasts| lock(pasts).len()).sum();
+        map.cells.len() * CELL_BYTES + map.table.len() * size_of::<u32>() + pixels * size_of::<Past>()
     }
 
     /// What is known of the light that the first camera sample of each pixel of a tile might get: the part that is
@@ -707,46 +620,6 @@ const PHOTONS_BELOW: f64 = 8.0;
 /// Photons that a task shoots.
 const CHUNK: u64 = 1024;
 
-/// Photons of a light.
-struct Photons<'a> {
-    auto: &'a Auto,
-    map: &'a Map,
-    stage: &'a Stage<'a>,
-    shower: &'a Shower<'a>,
-    light: u32,
-    lines: Range<u64>,
-}
-
-impl Task for Photons<'_> {
-    type Output = ();
-
-    #[inline(always)]
-    fn run<S: Simd>(self, simd: S) {
-        let Self { auto, map, stage, shower, light, lines } = self;
-        let (bvh, view, clearance) = (stage.bvh.on(simd), map.view(), stage.bvh.clearance());
-        let mut hits: Vec<Hit> = Vec::new();
-        for line in lines {
-            let (ray, at) = shower.ray_and_place(line, light);
-            hits.clear();
-            bvh.each_hit(&ray, None, &mut Uncounted, |hit| {
-                hits.push(hit);
-                ControlFlow::Continue(())
-            });
-            hits.sort_unstable_by(|a, b| a.t.total_cmp(&b.t).then(a.triangle.cmp(&b.triangle)));
-            let Some(first) = hits.first().map(|hit| hit.t + clearance) else { continue };
-            for hit in &hits {
-                let [a, b, c] = stage.scene.vertices(hit.triangle);
-                let Some(normal) = (b - a).cross(c - a).try_normalize() else { continue };
-                let normal = if normal.dot(ray.direction) < 0.0 { normal } else { -normal };
-                let key = map.key(&auto.options, stage.eye, ray.at(hit.t), normal, light);
-                if let Some(cell) = key.and_then(|key| view.find(key)) {
-                    map.count(cell * BINS + bin(at), hit.t <= first);
-                }
-            }
-        }
-    }
-}
-
 impl Visibility for Auto {
     fn begin(&self, stage: &Stage<'_>, tiles: &[Tile], width: u32) {
         let mut map = self.map.write().unwrap_or_else(|poisoned| poisoned.into_inner());
@@ -754,8 +627,16 @@ impl Visibility for Auto {
         let beside = stage.camera.ray_direction(0.5 * width as f32 + 1.0, 0.5 * width as f32);
         let most_strays = self.options.memory / size_of::<Stray>() / tiles.len().max(1);
         *map = Map { angle: (beside - ahead).length() / ahead.length(), most_strays, ..Map::default() };
+        // Half of the memory is for the cells at least.
+        let each = tiles.iter().map(|tile| tile.len()).sum::<usize>().max(1) * size_of::<Past>();
+        map.remembered = (self.options.memory / 2 / each).min(stage.lights.len());
+        map.room = self.options.memory - map.remembered * each;
+        if map.remembered > 0 {
+            let pasts = |tile: &Tile| vec![Past::default(); tile.len() * map.remembered];
+            map.pasts = tiles.iter().map(|tile| ([tile.x, tile.y], Mutex::new(pasts(tile)))).collect();
+        }
         if let Some(before) = &self.before {
-            map.remember(before, &self.options);
+            map.remember(before);
         }
         let found = &*map;
         // A look at every other pixel of every other row finds nearly all cells there are.
@@ -790,7 +671,7 @@ impl Visibility for Auto {
         let points: usize = looks.iter().map(|look| look.1).sum();
         let strays: Vec<Stray> = looks.into_iter().flat_map(|look| look.0).collect();
         map.samples = f64::from(stage.shadow_rays) * points as f64 / strays.len().max(1) as f64;
-        map.take_in(strays.clone(), stage, &self.options);
+        map.take_in(strays.clone(), stage);
         self.seed(&map, stage);
         map.prove(stage);
         map.probe(&strays, stage);
@@ -800,56 +681,96 @@ impl Visibility for Auto {
 
     fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
-        if map.asleep {
-            return sample_lights(stage, scratch);
-        }
         let view = map.view();
         let Scratch { samplers, questions, shares, square, fan, radiance, .. } = scratch;
+        let mut pasts = map.pasts_of(questions.place);
         let mut strays = Vec::new();
         // Neighbours are in the same cells.
         let mut last = None;
         let mut found: Vec<Option<Option<usize>>> = vec![None; stage.lights.len()];
         let mut known: Vec<(Known, Option<usize>)> = Vec::new();
+        let mut nearby: Vec<Option<Nearby>> = Vec::new();
         for index in 0..questions.points.len() {
             let point = questions.points[index];
             let sampler = &mut samplers[point.path as usize];
             expect(stage, &point, shares);
-            let place = map.key(&self.options, stage.eye, point.x, point.normal, 0);
-            if place != last {
-                last = place;
-                found.fill(None);
-            }
             known.clear();
-            let mut informed = false;
-            for share in shares.iter_mut() {
-                let light = share.light;
-                let key = || place.and_then(|key| key.with_light(light));
-                let cell = *found[light as usize].get_or_insert_with(|| key().and_then(|key| view.find(key)));
-                let thought = match cell.map(|cell| view.cells()[cell].known(point.origin)) {
-                    Some(Known::Odds) if map.passes < TRIAL => Known::Nothing,
-                    Some(thought) => thought,
-                    None => Known::Nothing,
-                };
-                known.push((thought, cell));
-                if thought == Known::Lit {
+            nearby.clear();
+            let mut told = Told::default();
+            if map.asleep {
+                known.resize(shares.len(), (Known::All, None));
+            } else {
+                let place = map.key(&self.options, stage.eye, point.x, point.normal, 0);
+                if place != last {
+                    last = place;
+                    found.fill(None);
+                }
+                for share in shares.iter() {
+                    let light = share.light;
+                    let key = || place.and_then(|key| key.with_light(light));
+                    let cell =
+                        *found[light as usize].get_or_insert_with(|| key().and_then(|key| view.find(key)));
+                    let thought = match cell.map(|cell| view.cells()[cell].known(point.origin)) {
+                        Some(Known::Odds) if map.passes < TRIAL => Known::Nothing,
+                        Some(thought) => thought,
+                        None => Known::Nothing,
+                    };
+                    known.push((thought, cell));
+                    if thought == Known::Lit {
+                        continue;
+                    }
+                    let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
+                    if outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays {
+                        let stray = |key| Stray { key, origin: point.origin, normal: point.normal };
+                        strays.extend(key().map(stray));
+                    }
+                }
+            }
+            for (share, &mut (ref mut thought, cell)) in shares.iter_mut().zip(&mut known) {
+                if !stage.lights[share.light as usize].is_apart(point.x) {
+                    *thought = Known::All;
+                }
+                if *thought == Known::Lit {
+                    nearby.push(None);
+                    told.changed = true;
                     share.expected = 0.0;
-                    informed = true;
                     continue;
                 }
-                let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
-                if outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays {
-                    strays.extend(key().map(|key| Stray { key, origin: point.origin, normal: point.normal }));
-                }
-                if let (Known::Odds, Some(cell)) = (thought, cell) {
-                    share.expected *= view.cells()[cell].part();
-                    informed = true;
+                let near = pasts.as_ref().and_then(|pasts| {
+                    Nearby::new(pasts, questions.width, point.pixel, share.light as usize, map.remembered)
+                });
+                nearby.push(near);
+                let doubt = near.map_or(1.0, |near| near.doubt(share.expected));
+                told.changed |= doubt < 1.0;
+                told.most = told.most.max(doubt);
+                share.expected *= doubt;
+                told.sum += share.expected;
+                // What a cell thinks of a border only adds noise to a pixel that has none; and of one that has not been
+                // asked, its first samples tell more.
+                let bordered = cell.is_some_and(|cell| !view.cells()[cell].is_flat());
+                let many = share.expected >= FEW as f32;
+                let no_border = |near: Nearby| near.own_is_sure() || (many && near.is_new());
+                if *thought == Known::Odds && bordered && near.is_some_and(no_border) {
+                    *thought = Known::Nothing;
                 }
             }
-            round(stage, sampler, shares, !informed);
-            for (share, &(thought, cell)) in shares.iter().zip(&known) {
+            if told.changed && told.sum > 0.0 {
+                let worst = ((told.most - SURE_DOUBT) / (1.0 - SURE_DOUBT)).clamp(0.0, 1.0);
+                let rays = stage.shadow_rays as f32 * (SURE_RAYS + (1.0 - SURE_RAYS) * worst);
+                let scale = (rays / told.sum).min(MOST_MORE);
+                shares.iter_mut().for_each(|share| share.expected *= scale);
+            }
+            for (share, (thought, cell)) in shares.iter_mut().zip(&known) {
+                if let (Known::Odds, Some(cell)) = (thought, cell) {
+                    share.expected *= view.cells()[*cell].part();
+                    told.changed = true;
+                }
+            }
+            round(stage, sampler, shares, !told.changed);
+            for ((share, &(thought, cell)), near) in shares.iter().zip(&known).zip(&nearby) {
                 let area = &stage.lights[share.light as usize];
                 let full = point.diffuse * area.radiance;
-                let whole = share.unshadowed * FRAC_1_PI;
+                let whole = if area.is_apart(point.x) { share.unshadowed * FRAC_1_PI } else { f32::NAN };
                 if thought == Known::Lit {
                     radiance[point.path as usize] += full * whole;
                     continue;
@@ -857,55 +778,57 @@ impl Visibility for Auto {
                 let odds = cell.filter(|_| thought == Known::Odds).map(|cell| &view.cells()[cell]);
                 let cell = cell.filter(|_| thought != Known::All && heard(index as u32, map.passes));
                 if share.count == 0 {
-                    if let Some(cell) = odds {
+                    if let Some(cell) = odds.filter(|cell| !cell.is_flat()) {
                         radiance[point.path as usize] += full * (cell.mean() * whole);
+                    } else if !whole.is_nan()
+                        && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
+                    {
+                        radiance[point.path as usize] += full * past.unasked(whole);
                     }
                     continue;
                 }
+                let mut open = whole;
+                let near = near.filter(|_| thought != Known::Odds && whole.is_finite() && share.count >= FEW);
+                let doubt = near.and_then(|near| near.bins(share.expected).map(|bins| (bins, near)));
                 let first = questions.weights.len() as u32;
                 square.clear();
                 sampler.points(stage.pattern, share.count as usize, square);
-                match odds {
-                    Some(cell) if cell.is_flat() => {
-                        fan.open(stage, area, &point, square, share.each);
-                        let had: f32 = fan.weights.iter().sum();
-                        radiance[point.path as usize] += full * (cell.mean() * (whole - had));
-                    }
-                    Some(cell) => {
-                        let closely = share.expected >= FEW as f32;
-                        fan.resize(square.len());
-                        let [sum, had] = dispatch(
-                            stage.level,
-                            Draws {
-                                cell,
-                                fan,
-                                closely,
-                                whole,
-                                area,
-                                point: &point,
-                                square,
-                                each: share.each,
-                                clearance: stage.bvh.clearance(),
-                            },
-                        );
-                        radiance[point.path as usize] += full * (sum - had);
-                    }
-                    None => fan.open(stage, area, &point, square, share.each),
+                let closely = share.expected >= FEW as f32;
+                let (each, clearance) = (share.each, stage.bvh.clearance());
+                let point = &point;
+                let drawn = if let Some((bins, near)) = doubt {
+                    fan.resize(square.len());
+                    let cell = &Bins::new(bins, near.mean());
+                    let draws = Draws { cell, fan, closely, whole, area, point, square, each, clearance };
+                    Some(dispatch(stage.level, draws))
+                } else if let Some(cell) = odds.filter(|cell| !cell.is_flat()) {
+                    fan.resize(square.len());
+                    let draws = Draws { cell, fan, closely, whole, area, point, square, each, clearance };
+                    Some(dispatch(stage.level, draws))
+                } else {
+                    fan.open(stage, area, point, square, each);
+                    None
+                };
+                if let Some([known, had]) = drawn {
+                    open = f32::INFINITY;
+                    radiance[point.path as usize] += full * (known - had);
                 }
                 fan.append_to(questions);
                 let last = questions.weights.len() as u32;
                 if last > first {
-                    match cell {
-                        Some(_) => fan.append_bins_to(&mut questions.bins),
-                        None => questions.bins.resize(last as usize, 0),
-                    }
+                    fan.append_bins_to(&mut questions.bins);
                     questions.cells.push(cell.map_or(NOBODY, |cell| cell as u32));
-                    questions.batches.push(super::Batch {
+                    questions.batches.push(Batch {
                         point: index as u32,
                         light: share.light,
                         samples: first..last,
                         share: share.count as f32 * share.each,
                     });
+                    questions.wholes.push(open);
+                } else if open.is_finite()
+                    && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
+                {
+                    radiance[point.path as usize] += full * past.unasked(whole);
                 }
             }
         }
@@ -936,6 +859,28 @@ impl Visibility for Auto {
                 }
             }
         }
+        let mut pasts = map.pasts_of(questions.place);
+        for (batch, &whole) in questions.batches.iter().zip(&questions.wholes) {
+            let pixel = questions.points[batch.point as usize].pixel;
+            if whole.is_nan() {
+                continue;
+            }
+            let Some(past) = past_of(&mut pasts, pixel, batch.light, map.remembered) else { continue };
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let estimates = &mut estimates[samples.clone()];
+            let [all, free] = past::sums(&questions.weights[samples], estimates);
+            let off = if whole.is_finite() { whole - all } else { 0.0 };
+            let v = (free / all).min(1.0);
+            past.mark(
+                v,
+                &questions.bins[batch.samples.start as usize..batch.samples.end as usize],
+                estimates,
+            );
+            let more = past.asked(v, off) / all;
+            if more != 0.0 {
+                estimates.iter_mut().for_each(|estimate| *estimate += more);
+            }
+        }
         if doubts != Doubts::default() {
             self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
         }
@@ -949,7 +894,7 @@ impl Visibility for Auto {
         let strays =
             std::mem::take(&mut *self.strays.lock().unwrap_or_else(|poisoned| poisoned.into_inner()));
         if !strays.is_empty() {
-            map.take_in(strays, stage, &self.options);
+            map.take_in(strays, stage);
         }
         map.passes += 1;
         let doubts =

@@ -153,6 +153,11 @@ pub struct Questions {
     /// those the bin of the light.
     cells: Vec<u32>,
     bins: Vec<u8>,
+    /// And for each batch what would arrive with nothing in the way, of reflectance and radiance 1; infinite where
+    /// that has been dealt with, and not a number where it is not known.
+    wholes: Vec<f32>,
+    /// The tile's first column and row.
+    place: [u32; 2],
 }
 
 /// Who wants to hear of a batch if nobody does.
@@ -166,6 +171,7 @@ impl Questions {
         self.weights.clear();
         self.cells.clear();
         self.bins.clear();
+        self.wholes.clear();
     }
 }
 
@@ -300,6 +306,7 @@ impl<C: Counter> Task for Cast<'_, C> {
 fn cast(stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) {
     scratch.questions.clear();
     scratch.questions.width = tile.width;
+    scratch.questions.place = [tile.x, tile.y];
     scratch.samplers.clear();
     scratch.radiance.clear();
     scratch.radiance.resize(scratch.paths.len(), Vec3::ZERO);
@@ -449,6 +456,9 @@ impl Fan {
 
     /// The bins of the samples that send something.
     fn append_bins_to(&self, bins: &mut Vec<u8>) {
+        if self.weights.iter().all(|&weight| weight > 0.0) {
+            return bins.extend_from_slice(&self.bins);
+        }
         bins.extend(self.bins.iter().zip(&self.weights).filter(|(_, w)| **w > 0.0).map(|(bin, _)| bin));
     }
 

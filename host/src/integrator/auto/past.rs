@@ -1,0 +1,276 @@
+//! What a pixel has seen of a light, to take out what its samples have too much or too little of the light itself.
+//!
+//! The samples of a pass say that `a = mean of V w` arrives. With nothing in the way they would say `m = mean of w`, while
+//! what would arrive is known in closed form. So `c = whole - m` is how far off they are, 0 on average, and
+//! `a + u c` is right on average for any u that does not depend on them. The best u is about the visible part v, as the
+//! *other* passes saw it: for n passes, pass p is given
+//!
+//! ```text
+//!     u_p = (sum of v over the other passes) / (n - 1)
+//! ```
+//!
+//! and as passes come one by one, each adds what the sum `T_n` of all `u_p c_p` has changed by. Where a pixel sees the
+//! whole light, the sum is what would arrive, without any noise; where it sees nothing of it, u is 0, and it stays black.
+//!
+//! On average `T_n` is 0, since c_p and v_q are of different passes and so of different random numbers.
+
+/// Sums over the passes of a pixel and a light.
+#[derive(Clone, Copy, Debug, Default)]
+pub(super) struct Past {
+    /// Passes in which the light was asked, and the sum of the parts that were visible.
+    asked: f32,
+    seen: f32,
+    /// Sum of c, and of v c.
+    off: f32,
+    both: f32,
+    /// Sum of c over passes that had no sample of the light.
+    unasked: f32,
+    /// The sum of `u c` so far.
+    sum: f32,
+    /// The bins of the light in which something was free, and in which something was blocked: a bit each.
+    seen_in: [u64; 2],
+}
+
+impl Past {
+    /// What a pass adds that saw the part `v`, with samples `c` short of the whole.
+    #[inline(always)]
+    pub(super) fn asked(&mut self, v: f32, c: f32) -> f32 {
+        self.asked += 1.0;
+        self.seen += v;
+        self.off += c;
+        self.both += v * c;
+        self.change()
+    }
+
+    /// What a pass adds that had no sample of the light, where all of it would send `c`.
+    #[inline(always)]
+    pub(super) fn unasked(&mut self, c: f32) -> f32 {
+        self.unasked += c;
+        self.change()
+    }
+
+    /// Notes in which bins samples were free and blocked.
+    #[inline(always)]
+    pub(super) fn mark(&mut self, v: f32, bins: &[u8], estimates: &[f32]) {
+        if v >= 1.0 {
+            self.seen_in[0] = u64::MAX;
+        } else if v <= 0.0 {
+            self.seen_in[1] = u64::MAX;
+        } else {
+            let [mut free, mut blocked] = [0u64; 2];
+            for (&bin, &estimate) in bins.iter().zip(estimates) {
+                let bit = 1u64 << (bin & 63);
+                free |= if estimate > 0.0 { bit } else { 0 };
+                blocked |= if estimate > 0.0 { 0 } else { bit };
+            }
+            self.seen_in[0] |= free;
+            self.seen_in[1] |= blocked;
+        }
+    }
+
+    /// The mean of the parts that were visible.
+    #[inline(always)]
+    pub(super) fn mean(&self) -> f32 {
+        if self.asked > 0.0 { (self.seen / self.asked).clamp(0.0, 1.0) } else { 0.0 }
+    }
+
+    /// Whether all of the light was seen each time, or nothing of it.
+    #[inline(always)]
+    pub(super) fn is_sure(&self) -> bool {
+        self.asked > 0.0 && (self.seen <= 0.0 || self.seen >= self.asked * 0.99999)
+    }
+
+    #[inline(always)]
+    fn change(&mut self) -> f32 {
+        let before = self.sum;
+        let others =
+            if self.asked > 1.0 { (self.seen * self.off - self.both) / (self.asked - 1.0) } else { 0.0 };
+        let none = if self.asked > 0.0 { self.seen * self.unasked / self.asked } else { 0.0 };
+        self.sum = others + none;
+        self.sum - before
+    }
+}
+
+/// How many rays may yet have seen something else, where none has.
+const UNSEEN: f32 = 1.0;
+
+/// The least doubt, where all around agree, and where a neighbour has seen something else.
+pub(super) const SURE_DOUBT: f32 = 0.25;
+const EDGE_DOUBT: f32 = 0.7;
+
+/// Rays before a pixel's bins tell anything.
+const ENOUGH: f32 = 128.0;
+
+/// With more bins in doubt, what is saved in the others is less than what it costs.
+const MOST_IN_DOUBT: u32 = 22;
+
+/// What a pixel and those around it have seen of a light.
+#[derive(Clone, Copy, Debug)]
+pub(super) struct Nearby {
+    own: Past,
+    /// As [`Past::seen_in`], of all.
+    seen_in: [u64; 2],
+}
+
+impl Nearby {
+    /// Of the neighbours in the same tile, which has so many columns.
+    #[inline]
+    pub(super) fn new(pasts: &[Past], width: u32, pixel: u32, light: usize, lights: usize) -> Option<Self> {
+        if light >= lights {
+            return None;
+        }
+        let own = *pasts.get(pixel as usize * lights + light)?;
+        let mut seen_in = [0u64; 2];
+        let width = width as usize;
+        let (x, y) = (pixel as usize % width, pixel as usize / width);
+        let columns = x.saturating_sub(1)..(x + 2).min(width);
+        for row in y.saturating_sub(1)..y + 2 {
+            for column in columns.clone() {
+                let Some(near) = pasts.get((row * width + column) * lights + light) else { continue };
+                seen_in[0] |= near.seen_in[0];
+                seen_in[1] |= near.seen_in[1];
+            }
+        }
+        Some(Self { own, seen_in })
+    }
+
+    /// Whether nothing was ever seen but all of the light, or nothing of it.
+    #[inline(always)]
+    fn is_sure(&self) -> bool {
+        self.own.asked > 0.0 && (self.seen_in[0] == 0 || self.seen_in[1] == 0)
+    }
+
+    /// Whether the pixel itself never saw anything else, whatever those around it saw.
+    #[inline(always)]
+    pub(super) fn own_is_sure(&self) -> bool {
+        self.own.is_sure()
+    }
+
+    /// Whether the pixel has not been asked yet.
+    #[inline(always)]
+    pub(super) fn is_new(&self) -> bool {
+        self.own.asked <= 0.0
+    }
+
+    /// The mean of the parts that the pixel saw.
+    #[inline(always)]
+    pub(super) fn mean(&self) -> f32 {
+        self.own.mean()
+    }
+
+    /// How much in doubt the light is, in units of the greatest: about the deviation of a sample.
+    #[inline(always)]
+    pub(super) fn doubt(&self, rays: f32) -> f32 {
+        if self.own.asked <= 0.0 {
+            return 1.0;
+        }
+        let rays = rays * self.own.asked;
+        let v = (self.own.mean() * rays + UNSEEN) / (rays + 2.0 * UNSEEN);
+        (4.0 * v * (1.0 - v)).sqrt().max(if self.is_sure() { SURE_DOUBT } else { EDGE_DOUBT })
+    }
+
+    /// The bins that are in doubt, and those that are free; `None` if it has not been asked often enough to tell, or
+    /// if most are in doubt.
+    #[inline]
+    pub(super) fn bins(&self, rays: f32) -> Option<[u64; 2]> {
+        if self.own.asked * rays < ENOUGH || self.own.is_sure() {
+            return None;
+        }
+        let doubt = !(self.own.seen_in[0] ^ self.own.seen_in[1]) | (self.seen_in[0] & self.seen_in[1]);
+        (1..=MOST_IN_DOUBT).contains(&doubt.count_ones()).then_some([doubt, self.own.seen_in[0] & !doubt])
+    }
+}
+
+/// The sum of the weights, and of those that arrive; in eight parts, so that the order does not depend on the machine.
+#[inline]
+pub(super) fn sums(weights: &[f32], estimates: &[f32]) -> [f32; 2] {
+    let (mut all, mut free) = ([0.0f32; 8], [0.0f32; 8]);
+    let (mut w, mut e) = (weights.chunks_exact(8), estimates.chunks_exact(8));
+    for (w, e) in w.by_ref().zip(e.by_ref()) {
+        for k in 0..8 {
+            all[k] += w[k];
+            free[k] += w[k] * e[k];
+        }
+    }
+    for (k, (w, e)) in w.remainder().iter().zip(e.remainder()).enumerate() {
+        all[k] += w;
+        free[k] += w * e;
+    }
+    [all, free].map(|x| ((x[0] + x[4]) + (x[1] + x[5])) + ((x[2] + x[6]) + (x[3] + x[7])))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// Four passes, each with one of three outcomes at random: nothing asked, or samples whose c is 0 on average.
+    #[test]
+    fn over_all_outcomes_what_is_added_is_zero() {
+        // Parts seen and c of each outcome, of passes that differ; without samples c is the whole.
+        let outcomes = [
+            [(None, 1.0), (Some(1.0), -0.2), (Some(0.25), -0.8)],
+            [(None, 0.5), (Some(0.0), 0.1), (Some(0.75), -0.6)],
+            [(None, 0.0), (Some(1.0), -0.3), (Some(1.0), 0.3)],
+            [(None, 2.0), (Some(0.5), -1.5), (Some(0.125), -0.5)],
+        ];
+        for passes in 1..=4 {
+            let (mut sum, mut most) = (0.0, 0.0f32);
+            let cases = 3usize.pow(passes);
+            for case in 0..cases {
+                let mut past = Past::default();
+                let mut total = 0.0;
+                for (pass, of) in outcomes.iter().enumerate().take(passes as usize) {
+                    let (seen, c) = of[case / 3usize.pow(pass as u32) % 3];
+                    total += match seen {
+                        Some(v) => past.asked(v, c),
+                        None => past.unasked(c),
+                    };
+                }
+                sum += total;
+                most = most.max(total.abs());
+            }
+            assert!((sum / cases as f32).abs() < 1e-6, "{passes} passes: {sum}");
+            assert!(passes < 2 || most > 0.1, "{passes} passes: {most}");
+        }
+    }
+
+    #[test]
+    fn what_is_seen_whole_has_no_noise_and_what_is_dark_stays_black() {
+        let (mut lit, mut dark) = (Past::default(), Past::default());
+        let (mut total, mut black) = (0.0, 0.0);
+        for mean in [0.9, 1.2, 0.7, 1.05] {
+            total += mean + lit.asked(1.0, 1.0 - mean);
+            black += dark.asked(0.0, 1.0 - mean);
+        }
+        assert!((total - 4.0f32).abs() < 1e-5 && black == 0.0, "{total} {black}");
+    }
+
+    #[test]
+    fn sums_are_over_all_samples() {
+        for count in 0..40 {
+            let weights: Vec<f32> = (0..count).map(|k| k as f32).collect();
+            let estimates: Vec<f32> = (0..count).map(|k| (k % 2) as f32).collect();
+            let all = weights.iter().sum::<f32>();
+            let free = weights.iter().zip(&estimates).map(|(w, e)| w * e).sum::<f32>();
+            assert_eq!(sums(&weights, &estimates), [all, free], "{count}");
+        }
+    }
+
+    #[test]
+    fn bins_are_in_doubt_where_a_pixel_or_its_neighbours_saw_both() {
+        let mut pasts = vec![Past::default(); 9];
+        for past in &mut pasts {
+            for _ in 0..2 {
+                past.asked(0.5, 0.0);
+                past.mark(0.5, &(0..64).collect::<Vec<u8>>(), &[[1.0; 32], [0.0; 32]].concat());
+            }
+        }
+        pasts[0].mark(0.5, &[3], &[0.0]);
+        let near = |pixel| Nearby::new(&pasts, 3, pixel, 0, 1).expect("one of them");
+        assert_eq!(near(4).bins(64.0), Some([1 << 3, 0xffff_ffff & !(1 << 3)]));
+        assert_eq!(near(8).bins(64.0), None, "none is in doubt");
+        assert_eq!(near(4).bins(8.0), None, "too few rays");
+        assert!(near(4).doubt(64.0) > 0.99);
+        assert!(Nearby::new(&pasts, 3, 9, 0, 1).is_none());
+    }
+}
