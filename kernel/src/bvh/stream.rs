@@ -204,7 +204,7 @@ impl<S: Simd> Bvh<'_, S> {
         ask: u64,
         part: impl Part,
         counter: &mut impl Counter,
-        learner: &mut impl Learner,
+        learner: &mut dyn Learner,
     ) -> u64 {
         if self.nodes.is_empty() {
             return 0;
@@ -223,15 +223,10 @@ impl<S: Simd> Bvh<'_, S> {
         ask: u64,
         part: impl Part,
         counter: &mut impl Counter,
-        learner: &mut impl Learner,
+        learner: &mut dyn Learner,
     ) -> u64 {
         let ask = ask & stream.every();
         let mut free = ask;
-        let mut k = 0;
-        while k < start.blocks.len() && free != 0 {
-            free &= !self.stream_at_block(stream, &start.blocks[k], free, part, counter, learner);
-            k += 1;
-        }
         let mut stack = Waiting::new();
         if start.root {
             stack.push((Child::node(0), ask));
@@ -242,24 +237,32 @@ impl<S: Simd> Bvh<'_, S> {
             stack.push((child, may));
             k += 1;
         }
-        let mut k = start.nodes.len();
-        while k > 0 && free != 0 {
-            k -= 1;
-            self.stream_at_node(stream, &start.nodes[k], free, &mut stack, part, counter);
-        }
-        while let Some((next, meet)) = stack.pop() {
-            let meet = meet & free;
-            if meet == 0 {
-                continue;
-            }
-            if next.is_leaf() {
-                let block = &self.blocks[next.index()];
-                free &= !self.stream_at_block(stream, block, meet, part, counter, learner);
-                if free == 0 {
-                    break;
-                }
+        // The tests are large, so they stand here once, for what is given as for what is come to.
+        let (mut blocks, mut nodes) = (0, start.nodes.len());
+        while free != 0 {
+            let (block, node, meet);
+            if blocks < start.blocks.len() {
+                (block, node, meet) = (Some(&start.blocks[blocks]), None, free);
+                blocks += 1;
+            } else if nodes > 0 {
+                nodes -= 1;
+                (block, node, meet) = (None, Some(&start.nodes[nodes]), free);
             } else {
-                self.stream_at_node(stream, &self.nodes[next.index()], meet, &mut stack, part, counter);
+                let Some((next, may)) = stack.pop() else { break };
+                meet = may & free;
+                if meet == 0 {
+                    continue;
+                }
+                (block, node) = if next.is_leaf() {
+                    (Some(&self.blocks[next.index()]), None)
+                } else {
+                    (None, Some(&self.nodes[next.index()]))
+                };
+            }
+            if let Some(block) = block {
+                free &= !self.stream_at_block(stream, block, meet, part, counter, learner);
+            } else if let Some(node) = node {
+                self.stream_at_node(stream, node, meet, &mut stack, part, counter);
             }
         }
         ask & !free
@@ -274,7 +277,7 @@ impl<S: Simd> Bvh<'_, S> {
         meet: u64,
         part: impl Part,
         counter: &mut impl Counter,
-        learner: &mut impl Learner,
+        learner: &mut dyn Learner,
     ) -> u64 {
         let token = self.simd.token();
         let width = S::Packet::WIDTH;

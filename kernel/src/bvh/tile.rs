@@ -680,6 +680,25 @@ impl<S: Simd> Bvh<'_, S> {
         learner: &mut impl Learner,
         blocked: &mut [u64],
     ) {
+        self.simd.apart(
+            #[inline(always)]
+            || self.send_all(stream, packet, cut, list, ignore, counter, learner, blocked),
+        );
+    }
+
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn send_all(
+        &self,
+        stream: &mut Stream,
+        packet: &mut Packet,
+        cut: &Cut,
+        list: &List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        learner: &mut impl Learner,
+        blocked: &mut [u64],
+    ) {
         let token = self.simd.token();
         stream.clear();
         let mut from = 0;
