@@ -190,7 +190,8 @@ impl<S: Simd> Bvh<'_, S> {
         store(far, &mut stream.far, from);
         let mut eight = from / 8;
         while eight * 8 < from + S::Packet::WIDTH {
-            stream.near_side[eight & 7] = slabs.near_side();
+            // Of eight rays that come in several vectors nothing is known of all.
+            stream.near_side[eight & 7] = if S::Packet::WIDTH < 8 { None } else { slabs.near_side() };
             eight += 1;
         }
     }
