@@ -174,12 +174,7 @@ fn equal_error(options: &EqualError) {
         #[cfg_attr(not(feature = "embree"), expect(unused_mut, reason = "nobody to add"))]
         let mut peers = vec![tile(&place, level)];
         #[cfg(feature = "embree")]
-        for mode in occlude_benches::embree::MODES {
-            let Some(tree) = &trees[usize::from(mode.robust)] else { continue };
-            let answer =
-                Box::new(move |work: &Work, blocked: &mut [u64]| tree.answer(mode, level, work, blocked));
-            peers.push(Peer { name: mode.name.to_owned(), family: "embree", answer });
-        }
+        peers.extend(occlude_benches::embree::peers(&trees, level));
         for &rays in &options.rays {
             let mut terms = Terms { seeds: options.seeds, ..Terms::new(level, rays) };
             terms.passes = options.passes.unwrap_or(terms.passes);

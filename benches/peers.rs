@@ -189,12 +189,7 @@ fn measure(options: &Options, level: Level, setting: &Setting, record: &mut Reco
     peers.push(Peer { name: "obvhs wide".to_owned(), family: "obvhs", answer });
     #[cfg(feature = "embree")]
     {
-        for mode in occlude_benches::embree::MODES {
-            let Some(tree) = &trees[usize::from(mode.robust)] else { continue };
-            let answer =
-                Box::new(move |work: &Work, blocked: &mut [u64]| tree.answer(mode, level, work, blocked));
-            peers.push(Peer { name: mode.name.to_owned(), family: "embree", answer });
-        }
+        peers.extend(occlude_benches::embree::peers(&trees, level));
         if let [Some(fast), Some(robust)] = &trees {
             row.embree_build = [fast, robust].map(|tree| tree.built.as_secs_f64());
             row.embree_bytes = [fast, robust].map(|tree| tree.tree_bytes());

@@ -444,7 +444,7 @@ fn what_was_learned_before_is_used_and_takes_no_more_memory_than_it_may() {
     let small = AutoOptions { memory: 1 << 16, ..AutoOptions::default() };
     let tight = Auto::with_saved(small, saved);
     setting.passes(&tight, 2, 64);
-    assert!(tight.bytes() <= 2 << 16, "{} bytes", tight.bytes());
+    assert!(tight.bytes() <= 1 << 16, "{} bytes", tight.bytes());
 }
 
 #[test]

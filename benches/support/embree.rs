@@ -4,8 +4,8 @@
 
 #![expect(unsafe_code, reason = "a C interface")]
 
-use crate::Work;
 use crate::pack::{Packed, Tracer};
+use crate::{Peer, Work};
 use glam::Vec3;
 use occlude_host::scene::Scene;
 use occlude_kernel::lanes::{Level, dispatch};
@@ -224,6 +224,16 @@ pub const MODES: [Mode; 12] = [
     Mode { name: "embree robust 16", width: 16, coherent: false, robust: true },
     Mode { name: "embree robust 16 coherent", width: 16, coherent: true, robust: true },
 ];
+
+/// All modes of a fast and a robust tree, as far as there is one.
+pub fn peers(trees: &[Option<Embree>; 2], level: Level) -> impl Iterator<Item = Peer<'_>> {
+    MODES.into_iter().filter_map(move |mode| {
+        let tree = trees[usize::from(mode.robust)].as_ref()?;
+        let answer =
+            Box::new(move |work: &Work, blocked: &mut [u64]| tree.answer(mode, level, work, blocked));
+        Some(Peer { name: mode.name.to_owned(), family: "embree", answer })
+    })
+}
 
 struct One<'a> {
     tree: &'a Embree,

@@ -125,6 +125,20 @@ pub(crate) enum Turn<L: Lanes> {
 }
 
 impl<L: Lanes> Turn<L> {
+    /// That of all rays, where their dominant axis is the same; `along` are the rays by axis.
+    #[inline(always)]
+    pub(crate) fn same(along: [u32; 3], rays: u32) -> Option<Self> {
+        if along[0] == rays {
+            Some(Self::Same(Axes::of(0)))
+        } else if along[1] == rays {
+            Some(Self::Same(Axes::of(1)))
+        } else if along[2] == rays {
+            Some(Self::Same(Axes::of(2)))
+        } else {
+            None
+        }
+    }
+
     /// By the longest axis of each direction: the rule of [`Axes::dominant`].
     #[inline(always)]
     pub(crate) fn each(direction: Vec3x<L>) -> Self {

@@ -21,7 +21,7 @@ mod seed;
 pub use saved::{SavedMap, fingerprint};
 
 use self::draws::{Bins, Draws};
-use self::past::{Nearby, Past, SURE_DOUBT};
+use self::past::{Nearby, Past};
 use self::prove::Prove;
 use self::saved::SavedCell;
 use self::seed::Photons;
@@ -61,6 +61,12 @@ impl Default for AutoOptions {
 
 /// Bytes of a cell, with what is counted for it.
 const CELL_BYTES: usize = size_of::<MapCell>() + BINS * size_of::<AtomicU64>() + 24;
+
+/// Bytes of so many cells, with the table that finds them.
+fn bytes_of(cells: usize) -> usize {
+    let table = if cells > 0 { OcclusionMap::table(cells) } else { 0 };
+    cells * CELL_BYTES + table * size_of::<u32>()
+}
 
 /// Rays at random where the map is not sure, and none where it is.
 #[derive(Debug, Default)]
@@ -212,14 +218,9 @@ const PHOTONS: u64 = 4;
 struct Told {
     /// Whether that is anything.
     changed: bool,
-    /// The greatest doubt.
-    most: f32,
     /// Samples that lights are due by their doubt.
     sum: f32,
 }
-
-/// What part of its shadow rays a point is worth where no light is in doubt; measured: a half and all are about as good.
-const SURE_RAYS: f32 = 1.0;
 
 /// A light in doubt gets no more than so many times the samples that its doubt is worth.
 const MOST_MORE: f32 = 8.0;
@@ -271,7 +272,7 @@ impl Map {
 
     /// Takes in what was learned before, as far as there is room.
     fn remember(&mut self, saved: &SavedMap) {
-        let room = self.room / CELL_BYTES;
+        let room = (0..saved.cells.len()).take_while(|&before| bytes_of(before + 1) <= self.room).count();
         self.full = saved.cells.len() > room;
         for SavedCell { cell, points, tallies } in saved.cells.iter().take(room) {
             self.cells.push(*cell);
@@ -300,7 +301,7 @@ impl Map {
             let found = if self.table.is_empty() { None } else { self.view().find(key) };
             let index = match found {
                 Some(index) => index,
-                None if (self.cells.len() + 1) * CELL_BYTES > self.room => {
+                None if bytes_of(self.cells.len() + 1) > self.room => {
                     self.full = true;
                     continue;
                 }
@@ -540,7 +541,7 @@ impl Auto {
     pub fn bytes(&self) -> usize {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
         let pixels: usize = map.pasts.values().map(|pasts| lock(pasts).len()).sum();
-        map.cells.len() * CELL_BYTES + map.table.len() * size_of::<u32>() + pixels * size_of::<Past>()
+        bytes_of(map.cells.len()) + pixels * size_of::<Past>()
     }
 
     /// What is known of the light that the first camera sample of each pixel of a tile might get: the part that is
@@ -742,7 +743,6 @@ impl Visibility for Auto {
                 nearby.push(near);
                 let doubt = near.map_or(1.0, |near| near.doubt(share.expected));
                 told.changed |= doubt < 1.0;
-                told.most = told.most.max(doubt);
                 share.expected *= doubt;
                 told.sum += share.expected;
                 // What a cell thinks of a border only adds noise to a pixel that has none; and of one that has not been
@@ -755,9 +755,7 @@ impl Visibility for Auto {
                 }
             }
             if told.changed && told.sum > 0.0 {
-                let worst = ((told.most - SURE_DOUBT) / (1.0 - SURE_DOUBT)).clamp(0.0, 1.0);
-                let rays = stage.shadow_rays as f32 * (SURE_RAYS + (1.0 - SURE_RAYS) * worst);
-                let scale = (rays / told.sum).min(MOST_MORE);
+                let scale = (stage.shadow_rays as f32 / told.sum).min(MOST_MORE);
                 shares.iter_mut().for_each(|share| share.expected *= scale);
             }
             for (share, (thought, cell)) in shares.iter_mut().zip(&known) {

@@ -289,9 +289,7 @@ impl<S: Simd> Bvh<'_, S> {
             if asked != 0 {
                 let direction =
                     vec3x::sub(targets_from::<S>(token, targets, first + i, first + count), origin);
-                let [a, b, c] = vec3x::abs(direction);
-                // The rule of `Axes::dominant`.
-                let turn = Turn::Each([b.le(a) & c.le(a), c.le(b)]);
+                let turn = Turn::each(direction);
                 let sheared = Sheared::new(token, turn, origin, direction, begin, end);
                 blocked |= (u64::from(sheared.cross(token, Single { block, lane }).hit.bits()) & asked) << i;
             }

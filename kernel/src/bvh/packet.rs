@@ -360,6 +360,14 @@ impl<S: Simd> Bvh<'_, S> {
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
+        if let Some(ready) = self.make_ready(rays, active) {
+            self.traverse_packet(&ready, part, counter, visitor);
+        }
+    }
+
+    /// Those of the rays of `active` that may hit something; `None` if none can.
+    #[inline(always)]
+    pub(super) fn make_ready(&self, rays: &Rays<S::Packet>, active: u32) -> Option<Ready<S::Packet>> {
         let token = self.simd.token();
         let infinity = S::Packet::splat(token, f32::INFINITY);
         let length = vec3x::abs(rays.direction);
@@ -369,46 +377,34 @@ impl<S: Simd> Bvh<'_, S> {
         let finite = finite & place[0].lt(infinity) & place[1].lt(infinity) & place[2].lt(infinity);
         let shortest = S::Packet::splat(token, SHORTEST);
         let active = active & (finite & shortest.le(vec3x::most(length))).bits();
+        if active == 0 {
+            return None;
+        }
         // The rule of `Axes::dominant`.
         let (first, second) = (y.le(x) & z.le(x), z.le(y));
         let along_x = active & first.bits();
         let along_y = active & !along_x & second.bits();
-        let along_z = active & !along_x & !along_y;
-        let along = [along_x, along_y, along_z];
-        if active == 0 {
-            return;
-        }
-        let turn = if along_x == active {
-            Turn::Same(Axes::of(0))
-        } else if along_y == active {
-            Turn::Same(Axes::of(1))
-        } else if along_z == active {
-            Turn::Same(Axes::of(2))
-        } else {
-            Turn::Each([first, second])
-        };
-
+        let along = [along_x, along_y, active & !along_x & !along_y];
+        let turn = Turn::same(along, active).unwrap_or(Turn::Each([first, second]));
         let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
         let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
-        let slabs = PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
-        self.traverse_packet(rays, &slabs, turn, along, part, counter, visitor);
+        Some(Ready {
+            along,
+            slabs: PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack),
+            sheared: Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max),
+        })
     }
 
-    #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn traverse_packet<V: PacketVisitor<S::Packet>>(
         &self,
-        rays: &Rays<S::Packet>,
-        slabs: &PacketSlabs<S::Packet>,
-        turn: Turn<S::Packet>,
-        along: [u32; 3],
+        ready: &Ready<S::Packet>,
         part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
-        let token = self.simd.token();
+        let &Ready { along, ref slabs, sheared } = ready;
         let active = along[0] | along[1] | along[2];
-        let sheared = Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max);
         let mut this = Going { sheared, t_max: [0.0; 16], active };
         this.sheared.t_max.store(&mut this.t_max);
         // The child, the rays that meet its box, and where the first of them enters it.
@@ -612,6 +608,14 @@ impl<S: Simd> Bvh<'_, S> {
             }
         }
     }
+}
+
+/// Rays as boxes and triangles are held against them.
+pub(super) struct Ready<L: Lanes> {
+    /// By dominant axis.
+    pub(super) along: [u32; 3],
+    pub(super) slabs: PacketSlabs<L>,
+    pub(super) sheared: Sheared<L>,
 }
 
 /// A packet on its way through the tree.

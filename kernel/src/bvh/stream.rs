@@ -4,9 +4,9 @@
 //! or triangles at once, or each box or triangle against a vector of rays: whichever is less work there. What takes time
 //! besides the tests, above all guessing wrongly what comes next, is shared by all rays that come to a place.
 
-use super::packet::{FEW_AT_BLOCK, FEW_AT_NODE, Rays, transposed};
+use super::packet::{FEW_AT_BLOCK, FEW_AT_NODE, Rays, Ready, transposed};
 use super::pyramid::{Learner, MOST};
-use super::slabs::{PacketSlabs, SHORTEST, Slabs};
+use super::slabs::{PacketSlabs, Slabs};
 use super::{Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
@@ -100,15 +100,11 @@ impl Stream {
     #[inline(always)]
     fn packet_sheared<L: Lanes>(&self, token: L::Token, from: usize, rays: u32) -> Sheared<L> {
         let direction = vec3x::load(token, &self.direction, from);
-        let along = |axis: usize| (self.along[axis] >> from) as u32 & rays;
-        let turn = if along(0) == rays {
-            Turn::Same(Axes::of(0))
-        } else if along(1) == rays {
-            Turn::Same(Axes::of(1))
-        } else if along(2) == rays {
-            Turn::Same(Axes::of(2))
-        } else {
-            Turn::each(direction)
+        let [x, y, z] = self.along;
+        let along = [(x >> from) as u32 & rays, (y >> from) as u32 & rays, (z >> from) as u32 & rays];
+        let turn = match Turn::same(along, rays) {
+            Some(turn) => turn,
+            None => Turn::each(direction),
         };
         Sheared {
             turn,
@@ -147,43 +143,14 @@ impl<S: Simd> Bvh<'_, S> {
     /// Takes in the rays of `active` as those from `from` on, a multiple of the vectors' width.
     #[inline(always)]
     pub(super) fn join(&self, stream: &mut Stream, from: usize, rays: &Rays<S::Packet>, active: u32) {
-        let token = self.simd.token();
-        let infinity = S::Packet::splat(token, f32::INFINITY);
-        let length = vec3x::abs(rays.direction);
-        let place = vec3x::abs(rays.origin);
-        let [x, y, z] = length;
-        let finite = x.lt(infinity) & y.lt(infinity) & z.lt(infinity);
-        let finite = finite & place[0].lt(infinity) & place[1].lt(infinity) & place[2].lt(infinity);
-        let shortest = S::Packet::splat(token, SHORTEST);
-        let active = active & (finite & shortest.le(vec3x::most(length))).bits();
-        if active == 0 {
-            return;
-        }
-        // The rule of `Axes::dominant`.
-        let (first, second) = (y.le(x) & z.le(x), z.le(y));
-        let along_x = active & first.bits();
-        let along_y = active & !along_x & second.bits();
-        let along_z = active & !along_x & !along_y;
-        stream.along[0] |= u64::from(along_x) << from;
-        stream.along[1] |= u64::from(along_y) << from;
-        stream.along[2] |= u64::from(along_z) << from;
-        let turn = if along_x == active {
-            Turn::Same(Axes::of(0))
-        } else if along_y == active {
-            Turn::Same(Axes::of(1))
-        } else if along_z == active {
-            Turn::Same(Axes::of(2))
-        } else {
-            Turn::Each([first, second])
-        };
-        let sheared = Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max);
+        let Some(Ready { along, slabs, sheared }) = self.make_ready(rays, active) else { return };
+        stream.along[0] |= u64::from(along[0]) << from;
+        stream.along[1] |= u64::from(along[1]) << from;
+        stream.along[2] |= u64::from(along[2]) << from;
         store(sheared.turned, &mut stream.turned, from);
         store(sheared.origin, &mut stream.origin, from);
         store(sheared.direction, &mut stream.direction, from);
         store(sheared.shear, &mut stream.shear, from);
-        let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
-        let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
-        let slabs = PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
         let [inverse, near, far] = slabs.constants();
         store(inverse, &mut stream.inverse, from);
         store(near, &mut stream.near, from);

@@ -95,7 +95,7 @@ impl Past {
 const UNSEEN: f32 = 1.0;
 
 /// The least doubt, where all around agree, and where a neighbour has seen something else.
-pub(super) const SURE_DOUBT: f32 = 0.25;
+const SURE_DOUBT: f32 = 0.25;
 const EDGE_DOUBT: f32 = 0.7;
 
 /// Rays before a pixel's bins tell anything.
