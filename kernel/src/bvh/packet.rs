@@ -361,7 +361,7 @@ impl<S: Simd> Bvh<'_, S> {
         visitor: &mut V,
     ) {
         if let Some(ready) = self.make_ready(rays, active) {
-            self.traverse_packet(&ready, part, counter, visitor);
+            self.traverse_packet(rays, &ready, part, counter, visitor);
         }
     }
 
@@ -387,24 +387,23 @@ impl<S: Simd> Bvh<'_, S> {
         let along = [along_x, along_y, active & !along_x & !along_y];
         let turn = Turn::same(along, active).unwrap_or(Turn::Each([first, second]));
         let reach = S::Packet::splat(token, self.magnitude) + vec3x::most(place);
-        let slack = reach * S::Packet::splat(token, 16.0 * super::ROUNDING);
-        Some(Ready {
-            along,
-            slabs: PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack),
-            sheared: Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max),
-        })
+        Some(Ready { along, turn, slack: reach * S::Packet::splat(token, 16.0 * super::ROUNDING) })
     }
 
     #[inline(always)]
     fn traverse_packet<V: PacketVisitor<S::Packet>>(
         &self,
+        rays: &Rays<S::Packet>,
         ready: &Ready<S::Packet>,
         part: impl Part,
         counter: &mut impl Counter,
         visitor: &mut V,
     ) {
-        let &Ready { along, ref slabs, sheared } = ready;
+        let token = self.simd.token();
+        let &Ready { along, turn, slack } = ready;
         let active = along[0] | along[1] | along[2];
+        let slabs = &PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
+        let sheared = Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max);
         let mut this = Going { sheared, t_max: [0.0; 16], active };
         this.sheared.t_max.store(&mut this.t_max);
         // The child, the rays that meet its box, and where the first of them enters it.
@@ -610,12 +609,13 @@ impl<S: Simd> Bvh<'_, S> {
     }
 }
 
-/// Rays as boxes and triangles are held against them.
+/// What boxes and triangles are held against rays with.
 pub(super) struct Ready<L: Lanes> {
-    /// By dominant axis.
+    /// The rays by dominant axis.
     pub(super) along: [u32; 3],
-    pub(super) slabs: PacketSlabs<L>,
-    pub(super) sheared: Sheared<L>,
+    pub(super) turn: Turn<L>,
+    /// What boxes are widened by.
+    pub(super) slack: L,
 }
 
 /// A packet on its way through the tree.

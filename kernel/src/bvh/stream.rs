@@ -143,14 +143,18 @@ impl<S: Simd> Bvh<'_, S> {
     /// Takes in the rays of `active` as those from `from` on, a multiple of the vectors' width.
     #[inline(always)]
     pub(super) fn join(&self, stream: &mut Stream, from: usize, rays: &Rays<S::Packet>, active: u32) {
-        let Some(Ready { along, slabs, sheared }) = self.make_ready(rays, active) else { return };
+        let token = self.simd.token();
+        let Some(Ready { along, turn, slack }) = self.make_ready(rays, active) else { return };
         stream.along[0] |= u64::from(along[0]) << from;
         stream.along[1] |= u64::from(along[1]) << from;
         stream.along[2] |= u64::from(along[2]) << from;
+        let sheared = Sheared::new(token, turn, rays.origin, rays.direction, rays.t_min, rays.t_max);
         store(sheared.turned, &mut stream.turned, from);
         store(sheared.origin, &mut stream.origin, from);
         store(sheared.direction, &mut stream.direction, from);
         store(sheared.shear, &mut stream.shear, from);
+        let active = along[0] | along[1] | along[2];
+        let slabs = PacketSlabs::new(token, active, rays.origin, rays.direction, rays.t_min, slack);
         let [inverse, near, far] = slabs.constants();
         store(inverse, &mut stream.inverse, from);
         store(near, &mut stream.near, from);
