@@ -3,7 +3,7 @@
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
 use occlude_kernel::bvh::MAX_DEPTH;
-use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node};
+use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node, TriangleBlock};
 use occlude_tests::{Random, Triangle, bounds, meshes};
 
 const QUALITIES: [Quality; 3] = [Quality::Fast, Quality::Medium, Quality::High];
@@ -25,12 +25,18 @@ fn check(triangles: &[Triangle]) {
             }
         }
         assert!(seen.iter().all(|&times| times == 1), "every triangle is in one block");
-        let mut reached = vec![0; bvh.blocks().len()];
+        let mut reached = vec![[0; TriangleBlock::WIDTH]; bvh.blocks().len()];
         let mut deepest = 0;
         if !bvh.nodes().is_empty() {
             below(&bvh, Child::node(0), 0, &mut reached, &mut deepest);
         }
-        assert!(reached.iter().all(|&times| times == 1), "every block is in one node");
+        for (block, lanes) in bvh.blocks().iter().zip(&reached) {
+            let used = |lane: usize| u32::from(lane < block.len());
+            assert!(
+                lanes.iter().enumerate().all(|(lane, &times)| times == used(lane)),
+                "every triangle is in one leaf"
+            );
+        }
         assert!(deepest <= MAX_DEPTH, "{deepest} levels");
         let stats = accel.stats();
         assert_eq!(
@@ -45,13 +51,13 @@ fn below(
     bvh: &Bvh<'_>,
     child: Child,
     level: usize,
-    reached: &mut [u32],
+    reached: &mut [[u32; TriangleBlock::WIDTH]],
     deepest: &mut usize,
 ) -> (Vec3, Vec3) {
     if let Some(leaf) = child.as_leaf() {
-        reached[leaf] += 1;
-        let block = &bvh.blocks()[leaf];
-        return bounds((0..block.len()).flat_map(|lane| block.get(lane)).map(Vec3::from));
+        leaf.lanes().for_each(|lane| reached[leaf.block][lane] += 1);
+        let block = &bvh.blocks()[leaf.block];
+        return bounds(leaf.lanes().flat_map(|lane| block.get(lane)).map(Vec3::from));
     }
     let node = &bvh.nodes()[child.as_node().expect("not nothing")];
     *deepest = (*deepest).max(level + 1);

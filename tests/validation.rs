@@ -86,7 +86,7 @@ fn index_out_of_range() {
     assert_eq!(error(&[node(&[Child::leaf(0), Child::leaf(1)])], &[TriangleBlock::EMPTY]), want(1));
     assert_eq!(error(&[node(&[Child::node(1)])], &[]), want(0));
     assert_eq!(error(&[node(&[Child::node(Child::MAX_INDEX)])], &[]), want(0));
-    assert_eq!(error(&[node(&[Child::leaf(Child::MAX_INDEX)])], &[]), want(0));
+    assert_eq!(error(&[node(&[Child::leaf(Child::MAX_BLOCK)])], &[]), want(0));
 }
 
 #[test]
@@ -249,7 +249,10 @@ fn plausible_nodes() -> impl Strategy<Value = Vec<Node>> {
                 for (place, (to, kind, a, b, whim)) in children.into_iter().enumerate() {
                     let child = match kind {
                         0 => Child::NONE,
-                        1 => Child::leaf(to % 4),
+                        1 => {
+                            let first = u32::from(whim) % 8;
+                            Child::lanes(to % 4, first, 1 + to % (8 - first))
+                        }
                         _ if whim > 10 && index + 1 < count => {
                             Child::node(index + 1 + to % (count - index - 1))
                         }

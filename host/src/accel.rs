@@ -82,7 +82,8 @@ impl Accel {
             binary: &binary,
             triangles,
             nodes: Vec::with_capacity(triangles.len() / 20 + 1),
-            blocks: Vec::with_capacity(triangles.len() / 4 + 1),
+            blocks: Vec::with_capacity(triangles.len() / 7 + 1),
+            room: Default::default(),
         };
         cutter.root();
         let (nodes, blocks) = (cutter.nodes, cutter.blocks);
@@ -104,8 +105,14 @@ impl Accel {
         order.sort_unstable();
         let order: Vec<u32> = order.into_iter().map(|(_, i)| i).collect();
         let binary = Bvh2::default();
-        let mut cutter =
-            Cutter { plan: Vec::new(), binary: &binary, triangles, nodes: Vec::new(), blocks: Vec::new() };
+        let mut cutter = Cutter {
+            plan: Vec::new(),
+            binary: &binary,
+            triangles,
+            nodes: Vec::new(),
+            blocks: Vec::new(),
+            room: Default::default(),
+        };
         let parts: Vec<&[u32]> =
             order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
         cutter.place(1, parts.len(), |cutter, part| cutter.even(parts[part], 2));
@@ -296,6 +303,8 @@ struct Cutter<'a> {
     triangles: &'a [[Vec3; 3]],
     nodes: Vec<Node>,
     blocks: Vec<TriangleBlock>,
+    /// The last blocks with room, by the lanes that are left.
+    room: [Vec<usize>; TriangleBlock::WIDTH],
 }
 
 impl Cutter<'_> {
@@ -399,30 +408,50 @@ impl Cutter<'_> {
     /// Writes triangles as blocks under nodes of even fill.
     fn even(&mut self, triangles: &[u32], level: usize) -> Below {
         if triangles.len() <= TriangleBlock::WIDTH {
-            return self.block(triangles);
+            return self.leaf(triangles);
         }
         let share = triangles.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH);
         let parts: Vec<&[u32]> = triangles.chunks(share).collect();
         self.place(level, parts.len(), |cutter, part| cutter.even(parts[part], level + 1))
     }
 
-    fn block(&mut self, triangles: &[u32]) -> Below {
-        let mut block = TriangleBlock::EMPTY;
+    /// Writes triangles into lanes of the fullest block near by that has room for them.
+    fn leaf(&mut self, triangles: &[u32]) -> Below {
+        let count = triangles.len();
+        let near = self.blocks.len().saturating_sub(NEAR);
+        let fits = (count..TriangleBlock::WIDTH).find(|&room| {
+            let last = self.room[room].last();
+            if last.is_some_and(|&block| block < near) {
+                self.room[room].clear();
+            }
+            !self.room[room].is_empty()
+        });
+        let (index, first) = match fits.and_then(|room| self.room[room].pop().map(|block| (room, block))) {
+            Some((room, block)) => (block, TriangleBlock::WIDTH - room),
+            None => {
+                self.blocks.push(TriangleBlock::EMPTY);
+                (self.blocks.len() - 1, 0)
+            }
+        };
+        let left = TriangleBlock::WIDTH - first - count;
+        if left > 0 {
+            self.room[left].push(index);
+        }
+        let block = &mut self.blocks[index];
         let (mut lower, mut upper) = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
         for (lane, &triangle) in triangles.iter().enumerate() {
             let vertices = self.triangles[triangle as usize];
-            block.set(lane, vertices.map(|vertex| vertex.to_array()), triangle);
+            block.set(first + lane, vertices.map(|vertex| vertex.to_array()), triangle);
             for vertex in vertices {
                 (lower, upper) = (lower.min(vertex), upper.max(vertex));
             }
         }
-        self.blocks.push(block);
         let area = |&triangle: &u32| {
             let [a, b, c] = self.triangles[triangle as usize];
             0.5 * (b - a).cross(c - a).length()
         };
         Below {
-            child: Child::leaf(self.blocks.len() as u32 - 1),
+            child: Child::lanes(index as u32, first as u32, count as u32),
             lower,
             upper,
             area: triangles.iter().map(area).sum(),
@@ -430,6 +459,9 @@ impl Cutter<'_> {
         }
     }
 }
+
+/// A leaf shares a block with leaves that were written lately: this many blocks ago, at most.
+const NEAR: usize = 64;
 
 /// Levels that suffice for any number of triangles cut evenly: eight to the eleventh is more than an index holds.
 const LEVELS_OF_ANY: usize = 11;

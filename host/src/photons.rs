@@ -20,8 +20,7 @@ use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
 use occlude_kernel::photons::{Nearest, Neighbour, PhotonBlock, PhotonId, PhotonTree, Photons, Point, Split};
 use occlude_kernel::{
-    Bvh, Child, Hit, LightPhoton, NO_TRIANGLE, Native, OcclusionPhoton, PhotonMap, Ray, Simd, Uncounted,
-    offset,
+    Bvh, Child, Hit, LightPhoton, Native, OcclusionPhoton, PhotonMap, Ray, Simd, Uncounted, offset,
 };
 use rayon::prelude::*;
 use rounds::Cells;
@@ -144,7 +143,7 @@ fn treelets(bvh: &Bvh<'_>, size: u32) -> Vec<Child> {
     let mut counts = vec![0u32; nodes.len()];
     let count = |counts: &[u32], child: Child| {
         let node = child.as_node().map(|node| counts[node]);
-        node.or_else(|| child.as_leaf().map(|leaf| blocks[leaf].len() as u32)).unwrap_or(0)
+        node.or_else(|| child.as_leaf().map(|leaf| leaf.ids(blocks).len() as u32)).unwrap_or(0)
     };
     // Children come after their parents.
     for index in (0..nodes.len()).rev() {
@@ -168,7 +167,7 @@ fn below(bvh: &Bvh<'_>, root: Child, each: &mut impl FnMut(u32)) {
         if let Some(node) = child.as_node() {
             stack.extend(bvh.nodes()[node].children.iter().rev());
         } else if let Some(leaf) = child.as_leaf() {
-            bvh.blocks()[leaf].ids.iter().filter(|&&id| id != NO_TRIANGLE).for_each(|&id| each(id));
+            leaf.ids(bvh.blocks()).iter().for_each(|&id| each(id));
         }
     }
 }

@@ -75,18 +75,53 @@ impl Node {
     }
 }
 
-/// What a place of a [`Node`] refers to: another node, a block of triangles, or nothing.
+/// What a place of a [`Node`] refers to: another node, triangles of a block, or nothing.
+///
+/// Leaves may share a block, so that blocks are full where leaves are not.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Pod, Zeroable)]
 #[repr(transparent)]
 pub struct Child(u32);
 
+/// What a leaf refers to.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+pub struct Leaf {
+    /// The index of the block.
+    pub block: usize,
+    /// The first of its lanes that belong to the leaf.
+    pub first: usize,
+    /// How many do, one after the other; unused lanes are none of its triangles.
+    pub count: usize,
+}
+
+impl Leaf {
+    /// The lanes.
+    #[inline]
+    pub const fn lanes(self) -> core::ops::Range<usize> {
+        self.first..self.first + self.count
+    }
+
+    /// The numbers of its triangles. Panics if there is no such block.
+    #[inline]
+    pub fn ids(self, blocks: &[TriangleBlock]) -> &[u32] {
+        let block = &blocks[self.block];
+        let end = (self.first + self.count).min(block.len());
+        &block.ids[self.first.min(end)..end]
+    }
+}
+
 impl Child {
     const LEAF: u32 = 1 << 31;
+
+    /// Of a leaf: three bits for the lanes but one, three for the first lane, the block.
+    const LANES: u32 = 6;
+
+    /// The greatest index of a block that fits.
+    pub const MAX_BLOCK: u32 = (Self::LEAF >> Self::LANES) - 2;
 
     /// Nothing.
     pub const NONE: Self = Self(u32::MAX);
 
-    /// The greatest index that fits.
+    /// The greatest index of a node that fits.
     pub const MAX_INDEX: u32 = Self::LEAF - 2;
 
     /// An inner node, by its index.
@@ -95,10 +130,19 @@ impl Child {
         Self(index)
     }
 
-    /// A block of triangles, by its index.
+    /// A block of triangles, by its index. Panics if that is above [`Child::MAX_BLOCK`].
     #[inline(always)]
     pub const fn leaf(index: u32) -> Self {
-        Self(index | Self::LEAF)
+        Self::lanes(index, 0, TriangleBlock::WIDTH as u32)
+    }
+
+    /// `count` lanes of a block from the `first` on, by its index. Panics if that is above [`Child::MAX_BLOCK`], or if
+    /// there are no such lanes.
+    #[inline(always)]
+    pub const fn lanes(index: u32, first: u32, count: u32) -> Self {
+        assert!(index <= Self::MAX_BLOCK, "no leaf can name this block");
+        assert!(count >= 1 && first < 8 && first + count <= 8, "a block has eight lanes");
+        Self(Self::LEAF | index << Self::LANES | first << 3 | (count - 1))
     }
 
     /// The index of the inner node it refers to, if it does.
@@ -107,10 +151,16 @@ impl Child {
         if self.is_leaf() { None } else { Some(self.index()) }
     }
 
-    /// The index of the block it refers to, if it does.
+    /// The triangles it refers to, if it does.
     #[inline]
-    pub const fn as_leaf(self) -> Option<usize> {
-        if self.is_leaf() && self.0 != Self::NONE.0 { Some(self.index()) } else { None }
+    pub const fn as_leaf(self) -> Option<Leaf> {
+        if !self.is_leaf() || self.0 == Self::NONE.0 {
+            return None;
+        }
+        let (first, rest) = (self.0 as usize >> 3 & 7, self.0 as usize & 7);
+        // Bytes of anyone's may name lanes that there are not.
+        let count = if first + rest < 8 { rest + 1 } else { 8 - first };
+        Some(Leaf { block: self.block(), first, count })
     }
 
     #[inline(always)]
@@ -118,9 +168,22 @@ impl Child {
         self.0 & Self::LEAF != 0
     }
 
+    /// Of a node.
     #[inline(always)]
     const fn index(self) -> usize {
         (self.0 & !Self::LEAF) as usize
+    }
+
+    /// Of a leaf.
+    #[inline(always)]
+    const fn block(self) -> usize {
+        ((self.0 & !Self::LEAF) >> Self::LANES) as usize
+    }
+
+    /// The lanes of a leaf, as bits.
+    #[inline(always)]
+    const fn bits(self) -> u32 {
+        ((2 << (self.0 & 7)) - 1) << (self.0 >> 3 & 7) & 0xff
     }
 }
 
@@ -183,7 +246,9 @@ impl fmt::Display for BvhError {
             Self::TooDeep { node } => write!(f, "node {node}: deeper than {} levels", MAX_DEPTH),
             Self::Shared { node } => write!(f, "node {node}: has more than one parent"),
             Self::Vertex { block, lane } => write!(f, "block {block}, lane {lane}: a vertex is not finite"),
-            Self::TooMany => write!(f, "more than {} nodes or blocks", Child::MAX_INDEX),
+            Self::TooMany => {
+                write!(f, "more than {} nodes or {} blocks", Child::MAX_INDEX, Child::MAX_BLOCK)
+            }
         }
     }
 }
@@ -209,6 +274,9 @@ const CUT: usize = 16;
 
 /// What a stack of nodes yet to visit must hold: each level leaves up to seven behind.
 const STACK: usize = MAX_DEPTH * (Node::WIDTH - 1) + CUT;
+
+/// Every lane of a block.
+const ALL_LANES: u32 = 0xff;
 
 /// One unit in the last place of 1, halved: how far rounding moves a number, relative to it.
 const ROUNDING: f32 = f32::EPSILON / 2.0;
@@ -290,7 +358,7 @@ pub fn offset(point: impl Into<[f32; 3]>, normal: impl Into<[f32; 3]>, clearance
 }
 
 fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
-    if nodes.len().max(blocks.len()) > Child::MAX_INDEX as usize {
+    if blocks.len() > Child::MAX_BLOCK as usize {
         return Err(BvhError::TooMany);
     }
     for (index, block) in blocks.iter().enumerate() {
@@ -316,8 +384,8 @@ fn check_nodes(nodes: &[Node], leaves: usize) -> Result<(), BvhError> {
                 continue;
             }
             let at = (index as u32, place as u32);
-            let there = if child.is_leaf() { leaves } else { nodes.len() };
-            if child.index() >= there {
+            let beyond = if child.is_leaf() { child.block() >= leaves } else { child.index() >= nodes.len() };
+            if beyond {
                 return Err(BvhError::OutOfRange { node: at.0, place: at.1 });
             }
             if !child.is_leaf() && child.index() <= index {

@@ -422,7 +422,7 @@ impl<S: Simd> Bvh<'_, S> {
             }
             match &ends {
                 Some(ends) if few && next.is_leaf() => {
-                    let block = &self.blocks[next.index()];
+                    let block = (&self.blocks[next.block()], next.bits());
                     self.meet_block_each(block, meet, along, ends, &mut this, part, counter, visitor);
                 }
                 Some(ends) if few => {
@@ -430,7 +430,8 @@ impl<S: Simd> Bvh<'_, S> {
                     self.meet_node_each(node, meet, ends, &this, &mut stack, part, counter);
                 }
                 _ if next.is_leaf() => {
-                    self.meet_block(&self.blocks[next.index()], meet, &mut this, part, counter, visitor);
+                    let block = (&self.blocks[next.block()], next.bits());
+                    self.meet_block(block, meet, &mut this, part, counter, visitor);
                 }
                 _ => {
                     let node = &self.nodes[next.index()];
@@ -446,7 +447,7 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     fn meet_block<V: PacketVisitor<S::Packet>>(
         &self,
-        block: &TriangleBlock,
+        (block, mut lanes): (&TriangleBlock, u32),
         meet: u32,
         this: &mut Going<S::Packet>,
         part: impl Part,
@@ -454,19 +455,17 @@ impl<S: Simd> Bvh<'_, S> {
         visitor: &mut V,
     ) {
         let token = self.simd.token();
-        let mut lane = 0;
-        while lane < TriangleBlock::WIDTH {
-            let id = block.ids[lane];
+        while lanes != 0 {
+            let at = lanes.trailing_zeros() as usize & 7;
+            lanes &= lanes - 1;
+            let id = block.ids[at];
             if id == crate::triangle::NO_TRIANGLE {
                 break;
             }
             if !part.holds(id) {
-                lane += 1;
                 continue;
             }
             counter.triangle_tests((meet & this.active).count_ones());
-            let at = lane;
-            lane += 1;
             let crossing = this.sheared.cross(token, Single { block, lane: at });
             let bits = crossing.hit.bits() & meet & this.active;
             if bits == 0 {
@@ -538,7 +537,7 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     fn meet_block_each<V: PacketVisitor<S::Packet>>(
         &self,
-        block: &TriangleBlock,
+        (block, lanes): (&TriangleBlock, u32),
         meet: u32,
         along: [u32; 3],
         ends: &Ends,
@@ -554,8 +553,8 @@ impl<S: Simd> Bvh<'_, S> {
             left &= left - 1;
             let axis = usize::from(along[1] >> ray & 1 != 0) + 2 * usize::from(along[2] >> ray & 1 != 0);
             let sheared = ends.sheared::<S::Node>(token, Axes::of(axis), ray, this.t_max[ray]);
-            counter.triangle_tests(part.count(block));
-            let mut hits = sheared.block_hits(token, block);
+            counter.triangle_tests(part.count(block, lanes));
+            let mut hits = sheared.block_hits(token, block) & lanes;
             while hits != 0 {
                 let lane = hits.trailing_zeros() as usize & 7;
                 hits &= hits - 1;

@@ -15,13 +15,13 @@ pub trait Part: Copy {
     /// Does this triangle belong to it? Asked only of triangles whose parents are all `below`.
     fn holds(self, id: u32) -> bool;
 
-    /// How many triangles of a block belong to it: for counters, and not called for
+    /// How many triangles of a block, those in the lanes of `lanes`, belong to it: for counters, and not called for
     /// [`Uncounted`](crate::Uncounted).
     #[inline(always)]
-    fn count(self, block: &TriangleBlock) -> u32 {
+    fn count(self, block: &TriangleBlock, lanes: u32) -> u32 {
         let mut count = 0;
-        for id in block.ids {
-            count += u32::from(id != NO_TRIANGLE && self.holds(id));
+        for (lane, id) in block.ids.into_iter().enumerate() {
+            count += u32::from(lanes >> lane & 1 != 0 && id != NO_TRIANGLE && self.holds(id));
         }
         count
     }
@@ -40,7 +40,7 @@ impl Part for Option<u32> {
     }
 
     #[inline(always)]
-    fn count(self, block: &TriangleBlock) -> u32 {
-        block.len() as u32
+    fn count(self, block: &TriangleBlock, lanes: u32) -> u32 {
+        (((1 << block.len()) - 1) & lanes).count_ones()
     }
 }

@@ -941,15 +941,15 @@ impl<S: Simd> Bvh<'_, S> {
                 continue;
             }
             if next.is_leaf() {
-                let block = &self.blocks[next.index()];
+                let (block, lanes) = (&self.blocks[next.block()], next.bits());
                 if ask.count_ones() <= LEAF_LONE {
                     let mut rest = ask;
                     while rest != 0 {
                         let i = rest.trailing_zeros() as usize;
                         rest &= rest - 1;
                         let sheared = shear_one(simd, &pyramid.ray(i), pyramid.axis(i));
-                        counter.triangle_tests(part.count(block));
-                        let mut hits = sheared.cross_block(token, block, &mut found);
+                        counter.triangle_tests(part.count(block, lanes));
+                        let mut hits = sheared.cross_block(token, block, &mut found) & lanes;
                         while hits != 0 {
                             let lane = hits.trailing_zeros() as usize & 7;
                             hits &= hits - 1;
@@ -959,6 +959,7 @@ impl<S: Simd> Bvh<'_, S> {
                         }
                     }
                 } else {
+                    let block = (block, lanes);
                     let blocked =
                         self.block_blocked(pyramid, block, &mut going.forms, ask, part, counter, learner);
                     going.free &= !blocked;
@@ -1063,7 +1064,7 @@ impl<S: Simd> Bvh<'_, S> {
     pub(super) fn block_blocked(
         &self,
         pyramid: &Pyramid,
-        block: &TriangleBlock,
+        (block, lanes): (&TriangleBlock, u32),
         forms: &mut Forms,
         ask: u64,
         part: impl Part,
@@ -1073,7 +1074,7 @@ impl<S: Simd> Bvh<'_, S> {
         let simd = self.simd;
         let verdict = pyramid.set_up(simd, block, forms);
         let mut blocked = 0;
-        let mut open = verdict.open;
+        let mut open = verdict.open & lanes;
         while open != 0 {
             let lane = open.trailing_zeros() as usize & 7;
             open &= open - 1;

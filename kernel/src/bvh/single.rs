@@ -305,15 +305,15 @@ impl<S: Simd> Bvh<'_, S> {
         let (mut node, mut left) = (0, 0);
         loop {
             if next.is_leaf() {
-                let block = &self.blocks[next.index()];
-                counter.triangle_tests(part.count(block));
-                let mut hits = sheared.cross_block(token, block, &mut found);
+                let (block, lanes) = (&self.blocks[next.block()], next.bits());
+                counter.triangle_tests(part.count(block, lanes));
+                let mut hits = sheared.cross_block(token, block, &mut found) & lanes;
                 while hits != 0 {
                     let lane = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;
                     let id = block.ids[lane];
                     if part.holds(id) && visitor.hit(id, || found.hit(lane, id)).is_break() {
-                        return Some(Place { block: next.index(), lane });
+                        return Some(Place { block: next.block(), lane });
                     }
                 }
             } else {
@@ -365,9 +365,9 @@ impl<S: Simd> Bvh<'_, S> {
         let mut found = Found::NOTHING;
         loop {
             if next.is_leaf() {
-                let block = &self.blocks[next.index()];
-                counter.triangle_tests(part.count(block));
-                let mut hits = sheared.cross_block(token, block, &mut found);
+                let (block, lanes) = (&self.blocks[next.block()], next.bits());
+                counter.triangle_tests(part.count(block, lanes));
+                let mut hits = sheared.cross_block(token, block, &mut found) & lanes;
                 while hits != 0 {
                     let lane = hits.trailing_zeros() as usize & 7;
                     hits &= hits - 1;

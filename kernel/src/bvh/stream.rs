@@ -7,7 +7,7 @@
 use super::packet::{FEW_AT_BLOCK, FEW_AT_NODE, Rays, Ready, transposed};
 use super::pyramid::{Learner, MOST};
 use super::slabs::{PacketSlabs, Slabs};
-use super::{Bvh, Child, Node, Part, STACK};
+use super::{ALL_LANES, Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::triangle::{Axes, NO_TRIANGLE, Sheared, Single, TriangleBlock, Turn};
@@ -214,7 +214,7 @@ impl<S: Simd> Bvh<'_, S> {
         while free != 0 {
             let (block, node, meet);
             if blocks < start.blocks.len() {
-                (block, node, meet) = (Some(&start.blocks[blocks]), None, free);
+                (block, node, meet) = (Some((&start.blocks[blocks], ALL_LANES)), None, free);
                 blocks += 1;
             } else if nodes > 0 {
                 nodes -= 1;
@@ -226,7 +226,7 @@ impl<S: Simd> Bvh<'_, S> {
                     continue;
                 }
                 (block, node) = if next.is_leaf() {
-                    (Some(&self.blocks[next.index()]), None)
+                    (Some((&self.blocks[next.block()], next.bits())), None)
                 } else {
                     (None, Some(&self.nodes[next.index()]))
                 };
@@ -245,7 +245,7 @@ impl<S: Simd> Bvh<'_, S> {
     fn stream_at_block(
         &self,
         stream: &Stream,
-        block: &TriangleBlock,
+        (block, lanes): (&TriangleBlock, u32),
         meet: u64,
         part: impl Part,
         counter: &mut impl Counter,
@@ -265,8 +265,9 @@ impl<S: Simd> Bvh<'_, S> {
                 while rays != 0 {
                     let ray = from + rays.trailing_zeros() as usize;
                     rays &= rays - 1;
-                    counter.triangle_tests(part.count(block));
-                    let mut hits = stream.sheared::<S::Node>(token, ray & 63).block_hits(token, block);
+                    counter.triangle_tests(part.count(block, lanes));
+                    let sheared = stream.sheared::<S::Node>(token, ray & 63);
+                    let mut hits = sheared.block_hits(token, block) & lanes;
                     while hits != 0 {
                         let lane = hits.trailing_zeros() as usize & 7;
                         hits &= hits - 1;
@@ -280,8 +281,13 @@ impl<S: Simd> Bvh<'_, S> {
                 continue;
             }
             let sheared = stream.packet_sheared::<S::Packet>(token, from, rays);
-            let mut lane = 0;
-            while lane < TriangleBlock::WIDTH && block.ids[lane] != NO_TRIANGLE {
+            let mut rest = lanes;
+            while rest != 0 {
+                let lane = rest.trailing_zeros() as usize & 7;
+                rest &= rest - 1;
+                if block.ids[lane] == NO_TRIANGLE {
+                    break;
+                }
                 if part.holds(block.ids[lane]) {
                     counter.triangle_tests(rays.count_ones());
                     let hit = sheared.cross(token, Single { block, lane }).hit.bits() & rays;
@@ -294,7 +300,6 @@ impl<S: Simd> Bvh<'_, S> {
                         }
                     }
                 }
-                lane += 1;
             }
         }
         if blocked != 0 {

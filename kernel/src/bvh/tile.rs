@@ -15,7 +15,7 @@ use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft, Turned};
 use super::single::Place;
 use super::stream::{Start, Stream};
-use super::{Bvh, CUT, Child, Node, Occluders, Targets};
+use super::{ALL_LANES, Bvh, CUT, Child, Node, Occluders, Part, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::triangle::{NO_TRIANGLE, TriangleBlock};
@@ -384,7 +384,8 @@ impl<S: Simd> Bvh<'_, S> {
                 (inner.count, inner_cut.count) = (0, 0);
                 let mut block = 0;
                 while block < given.blocks().len() {
-                    inner.take(&narrow, self.simd, &given.blocks[block], List::MOST, counter);
+                    let all = (&given.blocks[block], ALL_LANES);
+                    inner.take(&narrow, self.simd, all, List::MOST, counter);
                     block += 1;
                 }
                 true
@@ -611,7 +612,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut k = 0;
         while k * TriangleBlock::WIDTH < list.count && going.free != 0 {
             let ask = going.free;
-            let block = &list.blocks[k];
+            let block = (&list.blocks[k], ALL_LANES);
             let hidden =
                 self.block_blocked(pyramid, block, &mut going.forms, ask, ignore, counter, &mut Forgetful);
             going.free &= !hidden;
@@ -937,7 +938,7 @@ impl<S: Simd> Bvh<'_, S> {
             head += 1;
             done += 1;
             let enough = if next.is_leaf() {
-                list.take(shaft, self.simd, &self.blocks[next.index()], room, counter)
+                list.take(shaft, self.simd, (&self.blocks[next.block()], next.bits()), room, counter)
             } else {
                 self.enqueue(shaft, &self.nodes[next.index()], cut, &mut len, counter)
             };
@@ -981,12 +982,12 @@ impl List {
         &mut self,
         shaft: &Shaft,
         simd: S,
-        block: &TriangleBlock,
+        (block, lanes): (&TriangleBlock, u32),
         room: usize,
         counter: &mut impl Counter,
     ) -> bool {
-        counter.triangle_tests(block.len() as u32);
-        let mut open = shaft.triangles(simd, block);
+        counter.triangle_tests(None::<u32>.count(block, lanes));
+        let mut open = shaft.triangles(simd, block) & lanes;
         while open != 0 {
             let lane = open.trailing_zeros() as usize & 7;
             open &= open - 1;

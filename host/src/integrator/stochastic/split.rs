@@ -8,7 +8,8 @@ use crate::error::{Error, Result};
 use crate::sampler::Sampler;
 use crate::scene::Scene;
 use glam::Vec3;
-use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node, Part};
+use occlude_kernel::bvh::Leaf;
+use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node, Part, TriangleBlock};
 
 /// How blockers are divided into groups.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -37,8 +38,9 @@ pub(super) struct Units {
     split: Split,
     groups: usize,
     nodes: Vec<u32>,
-    blocks: Vec<u32>,
-    /// Empty where units are made of whole blocks.
+    /// A mark for each lane of each block, of which that of a leaf's first counts.
+    leaves: Vec<u32>,
+    /// Empty where units are made of whole leaves.
     triangles: Vec<u32>,
     /// Box and triangles of each.
     units: Vec<Unit>,
@@ -54,8 +56,9 @@ struct Unit {
 impl Units {
     /// For this many groups, up to 255. Costs one look at the tree.
     pub(super) fn new(scene: &Scene, bvh: &Bvh<'_>, split: Split, groups: usize) -> Result<Self> {
-        let (nodes, blocks) = (vec![MIXED; bvh.nodes().len()], vec![MIXED; bvh.blocks().len()]);
-        let mut units = Self { split, groups, nodes, blocks, triangles: Vec::new(), units: Vec::new() };
+        let (nodes, lanes) = (bvh.nodes().len(), bvh.blocks().len() * TriangleBlock::WIDTH);
+        let (nodes, leaves) = (vec![MIXED; nodes], vec![MIXED; lanes]);
+        let mut units = Self { split, groups, nodes, leaves, triangles: Vec::new(), units: Vec::new() };
         if split == Split::Object {
             if scene.objects.len() < groups {
                 return Err(Error::Usage(format!(
@@ -76,16 +79,16 @@ impl Units {
         Ok(units)
     }
 
-    /// Marks the blocks and subtrees whose triangles are of one unit.
+    /// Marks the leaves and subtrees whose triangles are of one unit.
     fn unify(&mut self, bvh: &Bvh<'_>) {
-        for (mark, block) in self.blocks.iter_mut().zip(bvh.blocks()) {
-            let ids = &block.ids[..block.len()];
-            let first = ids.first().map_or(MIXED, |&id| self.triangles[id as usize]);
-            let same = ids.iter().all(|&id| self.triangles[id as usize] == first);
-            *mark = if same { first } else { MIXED };
-        }
         // Children come after their parents.
         for (index, node) in bvh.nodes().iter().enumerate().rev() {
+            for leaf in children(node).filter_map(|(_, child)| child.as_leaf()) {
+                let ids = leaf.ids(bvh.blocks());
+                let first = ids.first().map_or(MIXED, |&id| self.triangles[id as usize]);
+                let same = ids.iter().all(|&id| self.triangles[id as usize] == first);
+                self.leaves[place_of(leaf)] = if same { first } else { MIXED };
+            }
             let mut marks = children(node).map(|(_, child)| self.mark(child));
             let first = marks.next().unwrap_or(MIXED);
             self.nodes[index] = if marks.all(|mark| mark == first) { first } else { MIXED };
@@ -94,7 +97,7 @@ impl Units {
 
     fn mark(&self, child: Child) -> u32 {
         let mark = match child.as_leaf() {
-            Some(block) => self.blocks.get(block),
+            Some(leaf) => self.leaves.get(place_of(leaf)),
             None => child.as_node().and_then(|node| self.nodes.get(node)),
         };
         mark.copied().unwrap_or(MIXED)
@@ -105,7 +108,7 @@ impl Units {
         let nodes = bvh.nodes();
         let mut counts = vec![0u32; nodes.len()];
         let count = |child: Child, counts: &[u32]| match (child.as_leaf(), child.as_node()) {
-            (Some(block), _) => bvh.blocks()[block].len() as u32,
+            (Some(leaf), _) => leaf.ids(bvh.blocks()).len() as u32,
             (_, Some(node)) => counts[node],
             _ => 0,
         };
@@ -147,8 +150,8 @@ impl Units {
             self.units.push(Unit { lower: corner(0), upper: corner(1), triangles });
             let mut below = vec![node.children[place]];
             while let Some(child) = below.pop() {
-                if let Some(block) = child.as_leaf() {
-                    self.blocks[block] = unit;
+                if let Some(leaf) = child.as_leaf() {
+                    self.leaves[place_of(leaf)] = unit;
                 } else if let Some(index) = child.as_node() {
                     self.nodes[index] = unit;
                     below.extend(children(&nodes[index]).map(|(_, child)| child));
@@ -199,6 +202,12 @@ fn children(node: &Node) -> impl Iterator<Item = (usize, Child)> {
     node.children.into_iter().enumerate().filter(|(_, child)| *child != Child::NONE)
 }
 
+/// Where the mark of a leaf stands.
+#[inline(always)]
+fn place_of(leaf: Leaf) -> usize {
+    leaf.block * TriangleBlock::WIDTH + leaf.first
+}
+
 fn of_triangle(scene: &Scene, triangle: u32) -> Unit {
     let [a, b, c] = scene.vertices(triangle);
     Unit { lower: a.min(b).min(c), upper: a.max(b).max(c), triangles: 1 }
@@ -241,7 +250,7 @@ impl Part for Members<'_> {
     #[inline(always)]
     fn below(self, child: Child) -> bool {
         let mark = match child.as_leaf() {
-            Some(block) => self.units.blocks[block],
+            Some(leaf) => self.units.leaves[place_of(leaf)],
             None => child.as_node().map_or(MIXED, |node| self.units.nodes[node]),
         };
         mark == MIXED || self.has(mark)
@@ -268,9 +277,8 @@ mod tests {
                 let part = Members { units, groups, group: group as u8 };
                 let (mut found, mut open) = (Vec::new(), vec![Child::node(0)]);
                 while let Some(child) = open.pop() {
-                    if let Some(block) = child.as_leaf() {
-                        let block = &bvh.blocks()[block];
-                        found.extend(block.ids[..block.len()].iter().filter(|&&id| part.holds(id)));
+                    if let Some(leaf) = child.as_leaf() {
+                        found.extend(leaf.ids(bvh.blocks()).iter().filter(|&&id| part.holds(id)));
                     } else if let Some(node) = child.as_node() {
                         let below = children(&bvh.nodes()[node]).map(|(_, child)| child);
                         open.extend(below.filter(|&child| part.below(child)));
