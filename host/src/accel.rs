@@ -220,8 +220,8 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
     let (distance, depth, reinsertion) = match quality {
         Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
         Quality::Medium => {
-            let fewer = (LARGE / boxes.len() as f32).min(1.0).powf(0.4);
-            (PlocSearchDistance::Medium, 3, 0.4 * fewer)
+            let fewer = (LARGE / boxes.len() as f32).min(1.0).sqrt();
+            (PlocSearchDistance::Medium, 3, 0.6 * fewer)
         }
         Quality::High => (PlocSearchDistance::High, 2, 1.0),
     };
