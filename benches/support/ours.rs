@@ -1,7 +1,7 @@
 //! The kernel's ways to answer, each a task that is entered once for all of the work.
 
-use crate::Work;
 use crate::pack::{Tracer, pack};
+use crate::{Batch, Work};
 use glam::Vec3;
 use occlude_kernel::lanes::{Level, Task, dispatch};
 use occlude_kernel::{
@@ -189,31 +189,31 @@ impl<C: Counter> Task for Tiles<'_, C> {
         while index < self.work.tiles.len() {
             let range = &self.work.tiles[index];
             let (begin, end) = (range.start as usize, range.end as usize);
-            let first = self.work.batches[begin].first;
-            let mut k = begin;
-            while k < end {
-                let batch = &self.work.batches[k];
-                let count = batch.last - batch.first;
-                points[k - begin] =
-                    TilePoint { x: batch.origin.to_array(), first: batch.first - first, count };
+            let batches = &self.work.batches[begin..end];
+            let first = batches[0].first;
+            let points = &mut points[..batches.len()];
+            let mut k = 0;
+            while k < batches.len() && k < points.len() {
+                let Batch { origin, first: from, last, .. } = batches[k];
+                points[k] = TilePoint { x: origin.to_array(), first: from - first, count: last - from };
                 k += 1;
             }
             let (from, to) = (first as usize, self.work.batches[end - 1].last as usize);
             if let Some(targets) = Targets::new(&x[from..to], &y[from..to], &z[from..to]) {
-                let [corner, u, v] = self.work.planes[self.work.batches[begin].light as usize];
+                let [corner, u, v] = self.work.planes[batches[0].light as usize];
                 let targets = targets.on_parallelogram(corner, u, v);
-                let points = &points[..end - begin];
                 bvh.occluded_tile(points, &targets, None, self.counter, &mut scratch, &mut answers);
             }
-            let mut k = begin;
-            while k < end {
-                let TilePoint { first, count, .. } = points[k - begin];
-                let (word, bit) = (first as usize / 64, first % 64);
+            let blocked = &mut self.blocked[begin..end];
+            let mut k = 0;
+            while k < blocked.len() && k < points.len() {
+                let TilePoint { first, count, .. } = points[k];
+                let (word, bit) = (first as usize / 64 % answers.len(), first % 64);
                 let mut bits = answers[word] >> bit;
-                if bit != 0 && word + 1 < answers.len() {
-                    bits |= answers[word + 1] << (64 - bit);
+                if bit + count > 64 {
+                    bits |= answers[(word + 1) % answers.len()] << (64 - bit);
                 }
-                self.blocked[k] = bits & u64::MAX.checked_shr(64 - count).unwrap_or(0);
+                blocked[k] = bits & u64::MAX.checked_shr(64 - count).unwrap_or(0);
                 k += 1;
             }
             index += 1;

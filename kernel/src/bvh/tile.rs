@@ -315,17 +315,23 @@ impl<S: Simd> Bvh<'_, S> {
     ) {
         let mut rays = 0;
         let mut k = 0;
+        let mut runs = 0;
+        let mut whole = (0, 0);
         while k < points.len() {
             let (first, end) = run(points, &mut k);
             clear(blocked, first, end - first);
             rays += end - first;
+            whole = (first, end);
+            runs += 1;
         }
+        // Most often all targets follow each other.
+        let whole = if runs == 1 { Some(whole) } else { None };
         if rays == 0 || self.nodes.is_empty() {
             counter.rays(rays as u32);
             return;
         }
         let wanted = rays >= WORTHWHILE;
-        let shaft = if wanted { self.shaft(points, targets, frame_of_points(points)) } else { None };
+        let shaft = if wanted { self.shaft(points, whole, targets, frame_of_points(points)) } else { None };
         let mut walls = Walls::NONE;
         if let (Some(shaft), false, None) = (&shaft, occluders.is_empty(), ignore)
             && self.walled_off(occluders, shaft, &mut walls, counter)
@@ -751,16 +757,23 @@ impl<S: Simd> Bvh<'_, S> {
         }
         let at = |index: usize| Vec3::from(corners[index]) - Vec3::from(corners[0]);
         let frame = frame(at(1).cross(at(2)), at(1));
-        let Some(shaft) = self.shaft(&points, targets, frame) else { return false };
+        let Some(shaft) = self.shaft(&points, None, targets, frame) else { return false };
         let TileScratch { cut, given, .. } = scratch;
         given.count = 0;
         let (root, rays) = (&self.nodes[..1], STEPS[0] * STEPS[2]);
         self.gather(&shaft, root, rays, points.len(), cut, given, counter) && given.count == 0
     }
 
-    /// The shaft around a tile's segments; `None` where it would say nothing.
+    /// The shaft around a tile's segments; `None` where it would say nothing. `whole` are the first and the last target of
+    /// all points, if they follow each other.
     #[inline(always)]
-    fn shaft(&self, points: &[TilePoint], targets: &Targets<'_>, frame: [Vec3; 3]) -> Option<Shaft> {
+    fn shaft(
+        &self,
+        points: &[TilePoint],
+        whole: Option<(usize, usize)>,
+        targets: &Targets<'_>,
+        frame: [Vec3; 3],
+    ) -> Option<Shaft> {
         type P<S> = <S as Simd>::Packet;
         let token = self.simd.token();
         let reference = Vec3::from(points[0].x);
@@ -771,7 +784,13 @@ impl<S: Simd> Bvh<'_, S> {
         let mut there = Around::<P<S>>::new(token, targets.turn());
         let mut k = 0;
         while k < points.len() {
-            let (first, end) = run(points, &mut k);
+            let (first, end) = match whole {
+                Some(whole) => {
+                    k = points.len();
+                    whole
+                }
+                None => run(points, &mut k),
+            };
             let origin = vec3x::splat::<P<S>>(token, reference.to_array());
             let mut i = first;
             while i < end {
@@ -913,7 +932,7 @@ impl<S: Simd> Bvh<'_, S> {
     ) -> bool {
         let [share, least, most] = STEPS;
         let steps = (rays / share).clamp(least, most);
-        let room = if rays < FEW * points { 16 } else { 64 };
+        let room = if rays < FEW * points { 8 } else { 64 };
         (cut.count, list.count) = (0, 0);
         let (mut head, mut len) = (0, 0);
         let mut done = 0;
@@ -1053,21 +1072,26 @@ pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
 /// The targets of points from the `k`th on that follow each other; `k` becomes the first point that breaks off.
 #[inline(always)]
 fn run(points: &[TilePoint], k: &mut usize) -> (usize, usize) {
-    let first = points[*k].first;
+    let rest = &points[*k..];
+    let first = rest[0].first;
     let mut end = first;
-    while *k < points.len() && points[*k].first == end {
-        end += points[*k].count;
-        *k += 1;
+    let mut i = 0;
+    while i < rest.len() && rest[i].first == end {
+        end += rest[i].count;
+        i += 1;
     }
+    *k += i;
     (first as usize, end as usize)
 }
 
 /// How many of the first points, up to 64, have a target each, one after the other?
 #[inline(always)]
 fn one_each(points: &[TilePoint]) -> usize {
-    let most = points.len().min(MOST);
+    let points = &points[..points.len().min(MOST)];
+    let mut next = points[0].first;
     let mut k = 0;
-    while k < most && points[k].count == 1 && points[k].first == points[0].first + k as u32 {
+    while k < points.len() && points[k].count == 1 && points[k].first == next {
+        next += 1;
         k += 1;
     }
     k
