@@ -28,7 +28,7 @@ impl<S: fearless_simd::Simd> Simd for Dispatched<S> {
 
     #[inline(always)]
     fn apart<R>(self, work: impl FnOnce() -> R) -> R {
-        fearless_simd::Simd::vectorize(self.0, work)
+        apart(self.0, work)
     }
 }
 
@@ -45,8 +45,14 @@ impl Simd for Dispatched16 {
 
     #[inline(always)]
     fn apart<R>(self, work: impl FnOnce() -> R) -> R {
-        fearless_simd::Simd::vectorize(self.0, work)
+        apart(self.0, work)
     }
+}
+
+/// Never inlined: where there is one caller, its function would grow beyond what a compiler does well, and soon.
+#[inline(never)]
+fn apart<S: fearless_simd::Simd, R>(token: S, work: impl FnOnce() -> R) -> R {
+    token.vectorize(work)
 }
 
 /// Work that is compiled once for each level. `run` and all it calls must be `#[inline(always)]`, or they are
