@@ -2,6 +2,7 @@
 
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
+use occlude_host::generate::{Kind, generate};
 use occlude_kernel::bvh::MAX_DEPTH;
 use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node, TriangleBlock};
 use occlude_tests::{Random, Triangle, bounds, meshes};
@@ -152,5 +153,19 @@ fn the_same_again() {
             );
             assert_eq!(first.bvh().blocks(), again.bvh().blocks());
         }
+    }
+}
+
+/// Leaves share blocks, so what a tree takes hardly depends on how many triangles its leaves have.
+#[test]
+fn trees_are_small() {
+    for kind in Kind::ALL {
+        let scene = generate(kind, 5, 20_000);
+        let accel = Accel::build(&scene, Quality::Medium);
+        let stats = accel.stats();
+        let bytes = stats.bytes as f64 / accel.triangles() as f64;
+        println!("{}: {bytes:.1} bytes a triangle, {:.2} a block", kind.name(), stats.triangles_per_block);
+        assert!(bytes < 64.0, "{}: {bytes:.1} bytes a triangle", kind.name());
+        assert!(stats.triangles_per_block > 6.0, "{}: {:.2} a block", kind.name(), stats.triangles_per_block);
     }
 }
