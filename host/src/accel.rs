@@ -58,6 +58,9 @@ const NODE_COST: f32 = 1.0;
 const BLOCK_COST: f32 = 1.0;
 
 impl Accel {
+    /// Triangles a tree can surely name: blocks are at least half full, and a leaf can name 2^25 of them.
+    pub const MOST_TRIANGLES: usize = 1 << 27;
+
     /// Builds the tree of a scene's triangles; triangle `i` keeps the number `i`.
     pub fn build(scene: &Scene, quality: Quality) -> Self {
         let triangles: Vec<[Vec3; 3]> =
@@ -65,7 +68,7 @@ impl Accel {
         Self::from_triangles(&triangles, quality)
     }
 
-    /// Builds the tree of triangles, which must be finite.
+    /// Builds the tree of triangles, which must be finite, and no more than [`Accel::MOST_TRIANGLES`].
     pub fn from_triangles(triangles: &[[Vec3; 3]], quality: Quality) -> Self {
         if triangles.is_empty() {
             return Self::default();

@@ -17,10 +17,11 @@ mod write;
 
 pub use write::{overwrite, write};
 
+use crate::accel::Accel;
 use crate::scene::Scene;
 
 /// The most triangles [`generate`] makes.
-pub const MOST_TRIANGLES: usize = 1 << 28;
+pub const MOST_TRIANGLES: usize = Accel::MOST_TRIANGLES;
 
 /// What [`generate`] makes.
 #[derive(Clone, Copy, Debug, PartialEq, Eq, Hash, clap::ValueEnum)]
@@ -70,7 +71,7 @@ impl Kind {
 /// ```
 ///
 /// - Below 1000 a scene keeps its least structure, and may have more than was asked for.
-/// - Above [`MOST_TRIANGLES`] the count is taken to be [`MOST_TRIANGLES`]: indices are 32 bits wide.
+/// - Above [`MOST_TRIANGLES`] the count is taken to be [`MOST_TRIANGLES`]: a tree can name no more.
 /// - The same `seed` gives the same bits everywhere. The sponge has nothing random in it.
 /// - Cost: one thread, well below a microsecond a triangle; no memory to speak of beside the scene.
 pub fn generate(kind: Kind, seed: u64, triangles: usize) -> Scene {

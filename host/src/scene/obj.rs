@@ -24,6 +24,7 @@ use super::lines::{Lines, is_plausible, keyword, shown, words};
 use super::mtl::Library;
 use super::polygon::{MAX_EARS, Splitter, is_degenerate};
 use super::{Object, Scene};
+use crate::accel::Accel;
 use crate::error::{Error, Result};
 
 /// How much checked text is prepared at a time.
@@ -237,10 +238,11 @@ impl Checked {
 
         self.corners += face.len() as u64;
         self.corners_of_mesh += face.len();
-        if self.corners > u64::from(u32::MAX) {
-            return Err(self.fault(line, "more triangles than 32 bits can count; split the file"));
-        }
         self.faces += 1;
+        if self.corners - 2 * u64::from(self.faces) > Accel::MOST_TRIANGLES as u64 {
+            let most = Accel::MOST_TRIANGLES;
+            return Err(self.fault(line, format!("more than {most} triangles; split the file")));
+        }
         self.face = face;
         Ok(())
     }
