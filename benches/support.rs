@@ -402,6 +402,11 @@ pub fn thread_time() -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
+/// How often a tree is built to say how long that takes.
+pub fn builds(scene: &Scene) -> usize {
+    if scene.triangles.len() > 2_000_000 { 1 } else { 3 }
+}
+
 /// The middle one; of two middle ones their mean. NaN of nothing.
 pub fn median(values: &mut [f64]) -> f64 {
     values.sort_by(f64::total_cmp);

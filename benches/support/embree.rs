@@ -5,7 +5,7 @@
 #![expect(unsafe_code, reason = "a C interface")]
 
 use crate::pack::{Packed, Tracer};
-use crate::{Peer, Work};
+use crate::{Peer, Work, builds};
 use glam::Vec3;
 use occlude_host::scene::Scene;
 use occlude_kernel::lanes::{Level, dispatch};
@@ -157,6 +157,18 @@ impl Embree {
             }
             Some(this)
         }
+    }
+
+    /// The last of some builds of it, with the least time of them.
+    pub fn quickest(scene: &Scene, robust: bool) -> Option<Self> {
+        let mut tree = Self::new(scene, robust)?;
+        for _ in 1..builds(scene) {
+            let before = tree.built;
+            drop(tree);
+            tree = Self::new(scene, robust)?;
+            tree.built = tree.built.min(before);
+        }
+        Some(tree)
     }
 
     /// Its version, as 31305 for 3.13.5.
