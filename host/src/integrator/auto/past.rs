@@ -95,8 +95,8 @@ impl Past {
 const UNSEEN: f32 = 1.0;
 
 /// The least doubt, where all around agree, and where a neighbour has seen something else.
-const SURE_DOUBT: f32 = 0.25;
-const EDGE_DOUBT: f32 = 0.7;
+const SURE_DOUBT: f32 = 0.1;
+const EDGE_DOUBT: f32 = 0.5;
 
 /// Rays before a pixel's bins tell anything.
 const ENOUGH: f32 = 128.0;
