@@ -242,6 +242,19 @@ struct Told {
     squares: f32,
 }
 
+impl Told {
+    /// Adds a light that would get so many samples, and that is so much in doubt.
+    fn add(&mut self, usual: f32, doubt: f32) {
+        self.changed |= doubt < 1.0;
+        self.sum += usual * doubt;
+        self.squares += usual * doubt * doubt;
+    }
+}
+
+/// At a first look a point asks one in so many of its usual rays, of a generator of its own.
+const PILOT: u32 = 2;
+const PILOT_KEY: u64 = 0x510e_527f_ade6_82d1;
+
 /// A light gets no more than so many times the usual number of samples, and no less than one in so many: no weight
 /// is more than this many times what it would be, or [`occlude_kernel::occlusion_map::LEAST_CHANCE`] times that where
 /// a cell's odds share the samples among bins.
@@ -340,6 +353,48 @@ impl Map {
     /// What the pixels of a tile have seen.
     fn pasts_of(&self, place: [u32; 2]) -> Option<MutexGuard<'_, TilePast>> {
         self.pasts.get(&place).map(lock)
+    }
+
+    /// Asks some rays at the points of a first look, so that pixels know about what they will see: those in between what
+    /// these saw that are next to them. Says what the points need.
+    ///
+    /// What these rays saw is no part of the picture, and their random numbers are their own.
+    fn pilot(&self, stage: &Stage<'_>, scratch: &mut Scratch) -> Needs {
+        let mut needs = Needs::default();
+        let rays = stage.shadow_rays / PILOT;
+        let Some(mut pasts) = self.pasts_of(scratch.questions.place).filter(|_| rays >= FEW / 2) else {
+            return needs;
+        };
+        for sampler in &mut scratch.samplers {
+            *sampler = Sampler::from_key(sampler.key() ^ PILOT_KEY);
+        }
+        sample_lights(&Stage { shadow_rays: rays, count: false, ..*stage }, scratch);
+        let Scratch { questions, estimates, shares, .. } = scratch;
+        exact::trace(&Stage { count: false, ..*stage }, &[], questions, estimates, &mut Counts::default());
+        let lights = self.remembered;
+        let pasts = &mut pasts.pasts;
+        for batch in questions.batches.iter().filter(|batch| (batch.light as usize) < lights) {
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let estimates = &estimates[samples.clone()];
+            let [all, free] = past::sums(&questions.weights[samples], estimates);
+            let pixel = questions.points[batch.point as usize].pixel as usize;
+            if let Some(past) = pasts.get_mut(pixel * lights + batch.light as usize) {
+                past.foresee((free / all).min(1.0), 1.0 / PILOT as f32);
+            }
+        }
+        past::spread(pasts, questions.width as usize, lights);
+        for point in &questions.points {
+            expect(stage, point, shares);
+            let mut told = Told::default();
+            for share in shares.iter() {
+                let light = share.light as usize;
+                let near = Nearby::new(pasts, questions.width, point.pixel, light, lights);
+                told.add(share.expected, near.map_or(1.0, |near| near.doubt(share.expected)));
+            }
+            let bright = brightness(stage, point.diffuse, shares, self.brightest);
+            needs.add(stage.shadow_rays, [told.sum * bright, told.squares * bright * bright]);
+        }
+        needs
     }
 
     fn view(&self) -> OcclusionMap<'_> {
@@ -739,7 +794,7 @@ impl Visibility for Auto {
         }
         let found = &*map;
         // A look at every other pixel of every other row finds nearly all cells there are.
-        let looks: Vec<(Vec<Stray>, usize)> = tiles
+        let looks: Vec<(Vec<Stray>, usize, Needs)> = tiles
             .par_iter()
             .map_init(Scratch::default, |scratch, &tile| {
                 scratch.paths.clear();
@@ -764,9 +819,13 @@ impl Visibility for Auto {
                     }
                 }
                 strays.truncate(most_strays);
-                (strays, scratch.questions.points.len())
+                let points = scratch.questions.points.len();
+                (strays, points, found.pilot(stage, scratch))
             })
             .collect();
+        let mut needs = Needs::default();
+        looks.iter().for_each(|look| needs.merge(&look.2));
+        map.scale = (needs.usual > 0).then(|| needs.scale());
         let points: usize = looks.iter().map(|look| look.1).sum();
         let strays: Vec<Stray> = looks.into_iter().flat_map(|look| look.0).collect();
         map.samples = f64::from(stage.shadow_rays) * points as f64 / strays.len().max(1) as f64;
@@ -857,10 +916,8 @@ impl Visibility for Auto {
                 });
                 nearby.push(near);
                 let doubt = near.map_or(1.0, |near| near.doubt(share.expected));
-                told.changed |= doubt < 1.0;
+                told.add(share.expected, doubt);
                 share.expected *= doubt;
-                told.sum += share.expected;
-                told.squares += share.expected * doubt;
                 // What a cell thinks of a border only adds noise to a pixel that has none; and of one that has not been
                 // asked, its first samples tell more.
                 let bordered = cell.is_some_and(|cell| !view.cells()[cell].is_flat());
@@ -1062,4 +1119,33 @@ impl Visibility for Auto {
 fn worth_learning(passes: u32) -> bool {
     let odd = passes >> passes.trailing_zeros();
     odd == 1 || odd == 3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn needs_scale_to_the_usual_number_and_tell_whether_weights_help() {
+        let needs = |weights: [f32; 2]| {
+            let mut needs = Needs::default();
+            weights.iter().for_each(|w| needs.add(16, [16.0 * w, 16.0 * w * w]));
+            needs
+        };
+        let unlike = needs([1.0, 0.25]);
+        assert_eq!(unlike.scale(), 1.6);
+        assert!(unlike.worth());
+        let mut alike = needs([0.5, 0.5]);
+        assert_eq!(alike.scale(), 2.0);
+        assert!(!alike.worth());
+        (alike.form, alike.shadow) = (1, 10);
+        assert!(!alike.worth(), "9 % of the variance");
+        alike.form = 2;
+        assert!(alike.worth());
+        assert_eq!(Needs::default().scale(), 1.0);
+        assert!(!Needs::default().worth());
+        let mut both = needs([1.0, 1.0]);
+        both.merge(&needs([0.25, 0.25]));
+        assert_eq!(both.scale(), unlike.scale());
+    }
 }
