@@ -278,12 +278,24 @@ impl Setting {
 
     /// The picture of each pass by itself.
     fn passes(&self, method: &dyn Visibility, passes: u32, shadow_rays: u32) -> Vec<Image> {
+        self.passes_and_rays(method, passes, shadow_rays, false).0
+    }
+
+    /// And how many shadow rays there were in all, if they are counted.
+    fn passes_and_rays(
+        &self,
+        method: &dyn Visibility,
+        passes: u32,
+        shadow_rays: u32,
+        count: bool,
+    ) -> (Vec<Image>, u64) {
         self.with_stage(shadow_rays, detect(), |stage| {
+            let stage = &Stage { count, ..*stage };
             let (width, height) = (self.camera.width, self.camera.height);
             let mut scratch = Scratch::default();
             let tiles: Vec<_> = Film::new(width, height).tiles().iter().map(|tile| tile.tile()).collect();
             method.begin(stage, &tiles, width);
-            (0..passes)
+            let images = (0..passes)
                 .map(|pass| {
                     let mut film = Film::new(width, height);
                     for tile in film.tiles_mut() {
@@ -292,7 +304,8 @@ impl Setting {
                     method.passed(stage);
                     film.develop()
                 })
-                .collect()
+                .collect();
+            (images, scratch.shadow_counts.rays)
         })
     }
 }
@@ -427,17 +440,20 @@ fn what_was_learned_before_is_used_and_takes_no_more_memory_than_it_may() {
     let auto = Auto::new(AutoOptions::default());
     setting.passes(&auto, 6, 64);
     let saved = setting.with_stage(64, detect(), |stage| auto.save(stage));
-    let error = |auto: &Auto| {
-        let passes = setting.passes(auto, 2, 64);
+    // Squared error times rays: what is known leaves out rays.
+    let price = |auto: &Auto| {
+        let (passes, rays) = setting.passes_and_rays(auto, 2, 64, true);
         let truth = setting.passes(&Exact, 2, 1024);
         // Of both passes together: the second makes good what the first had too much or too little of a light.
         let value = |images: &[Image], k: usize| images.iter().map(|image| image.pixels[k][1]).sum::<f32>();
         let pixels = 0..passes[0].pixels.len();
-        pixels.map(|k| f64::from(value(&passes, k) - value(&truth, k)).powi(2)).sum::<f64>()
+        let error = pixels.map(|k| f64::from(value(&passes, k) - value(&truth, k)).powi(2)).sum::<f64>();
+        println!("squared error {error}, {rays} rays");
+        error * rays as f64
     };
     let (fresh, learned) =
         (Auto::new(AutoOptions::default()), Auto::with_saved(AutoOptions::default(), saved.clone()));
-    let (before, after) = (error(&fresh), error(&learned));
+    let (before, after) = (price(&fresh), price(&learned));
     assert!(after < before, "{after} and {before}");
     let history = learned.history();
     assert!(history[0].odds + history[0].lit + history[0].left_alone > 0.8, "{:?}", history[0]);

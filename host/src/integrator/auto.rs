@@ -260,6 +260,9 @@ const PILOT_KEY: u64 = 0x510e_527f_ade6_82d1;
 /// a cell's odds share the samples among bins.
 const MOST_MORE: f32 = 8.0;
 
+/// Nor more than this, unless that is usual: what a tile asks is in memory at once.
+const MOST_RAYS: f32 = 2048.0;
+
 /// How much brighter or darker than others a point may count as.
 const BRIGHTNESS: [f32; 2] = [1.0 / 64.0, 8.0];
 
@@ -932,9 +935,9 @@ impl Visibility for Auto {
             if let Some(scale) = map.scale {
                 told.changed = true;
                 for (share, usual) in shares.iter_mut().zip(&*usual) {
-                    let most = share.expected * (scale * bright);
+                    let due = share.expected * (scale * bright);
                     share.expected = if share.expected > 0.0 {
-                        most.clamp(usual * (1.0 / MOST_MORE), usual * MOST_MORE)
+                        due.clamp(usual * (1.0 / MOST_MORE), (usual * MOST_MORE).min(usual.max(MOST_RAYS)))
                     } else {
                         0.0
                     };
