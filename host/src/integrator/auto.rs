@@ -280,7 +280,8 @@ const BRIGHTNESS: [f32; 2] = [1.0 / 64.0, 8.0];
 fn brightness(stage: &Stage<'_>, diffuse: Vec3, shares: &[Share], brightest: f32) -> f32 {
     let sent = |share: &Share| stage.lights[share.light as usize].radiance * share.unshadowed;
     let arrives = (shares.iter().map(sent).sum::<Vec3>() * diffuse).element_sum() / brightest;
-    arrives.sqrt().max(BRIGHTNESS[0]).min(BRIGHTNESS[1])
+    // Not a number counts as dark.
+    if arrives.sqrt() > BRIGHTNESS[0] { arrives.sqrt().min(BRIGHTNESS[1]) } else { BRIGHTNESS[0] }
 }
 
 /// What a tile remembers.
