@@ -39,7 +39,7 @@ use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::dispatch;
 use occlude_kernel::occlusion_map::{
-    BINS, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally,
+    BINS, CellKey, Demand, Doubts, Known, LEAST_CHANCE, MapCell, OcclusionMap, Rates, Tally,
 };
 use occlude_kernel::{Counts, Ray, TileScratch, offset};
 use rayon::prelude::*;
@@ -264,9 +264,9 @@ impl Told {
 const PILOT: u32 = 2;
 const PILOT_KEY: u64 = 0x510e_527f_ade6_82d1;
 
-/// A light gets no more than so many times the usual number of samples, and no less than one in so many: no weight
-/// is more than this many times what it would be, or [`occlude_kernel::occlusion_map::LEAST_CHANCE`] times that where
-/// a cell's odds share the samples among bins.
+/// A light gets no more than so many times the usual number of samples, and by doubt no less than one in so many. Together
+/// with the odds of a cell no part of it gets less than one in [`LEAST_CHANCE`], so no weight is more than that many times
+/// what it would be.
 const MOST_MORE: f32 = 8.0;
 
 /// Nor more than this, unless that is usual: what a tile asks is in memory at once.
@@ -961,9 +961,12 @@ impl Visibility for Auto {
                     };
                 }
             }
-            for (share, (thought, cell)) in shares.iter_mut().zip(&known) {
+            for ((share, (thought, cell)), usual) in shares.iter_mut().zip(&known).zip(&*usual) {
                 if let (Known::Odds, Some(cell)) = (thought, cell) {
-                    share.expected *= view.cells()[*cell].part();
+                    let cell = &view.cells()[*cell];
+                    // With odds that differ a bin may have the least chance already.
+                    let least = if cell.is_flat() { 1.0 / LEAST_CHANCE as f32 } else { cell.part() };
+                    share.expected = (share.expected * cell.part()).max(usual * least);
                     told.changed = true;
                 }
             }
