@@ -121,7 +121,18 @@ fn boxes_in_columns_change_no_bit() {
     let columns = scene("columns");
     let render = |switch: &str| {
         let (image, stats) = (format!("{switch}.pfm"), format!("{switch}.json"));
-        let args = ["render", &columns, "--size", "96x54", "--spp", "1", "--volumetric", switch];
+        let args = [
+            "render",
+            &columns,
+            "--size",
+            "96x54",
+            "--spp",
+            "1",
+            "--method",
+            "exact",
+            "--volumetric",
+            switch,
+        ];
         let done = occlude(&[&args[..], &["-o", &image, "--stats", &stats]].concat(), folder.path());
         assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
         let json = std::fs::read_to_string(folder.path().join(stats)).expect("statistics");
@@ -340,6 +351,30 @@ fn the_map_that_learns_renders_and_is_compared() {
     let read = |name: &str| std::fs::read(folder.path().join(name)).expect(name);
     assert!(read("auto.exr") == read("again.exr"), "the same for any number of threads");
     assert!(read("auto.exr") != read("plain.exr"));
+    done(&[&common[..], &["-o", "default.exr"]].concat());
+    assert!(read("auto.exr") == read("default.exr"), "it is the default");
+
+    // With a single ray some averages come out below 0; what is written does not.
+    done(&[
+        "render",
+        &columns,
+        "--size",
+        "96x54",
+        "-q",
+        "--shadow-rays",
+        "1",
+        "-o",
+        "one.pfm",
+        "--stats",
+        "one.json",
+    ]);
+    let stats = std::fs::read_to_string(folder.path().join("one.json")).expect("statistics");
+    let stats: serde_json::Value = serde_json::from_str(&stats).expect("JSON");
+    assert!(stats["settled"]["pixels"].as_u64() > Some(0), "{}", stats["settled"]);
+    assert!(stats["settled"]["part"].as_f64() < Some(1e-3), "{}", stats["settled"]);
+    let compared = occlude(&["compare", "--json", "one.pfm", "one.pfm"], folder.path());
+    let found: serde_json::Value = serde_json::from_str(&text(&compared.stdout)).expect("JSON");
+    assert_eq!((&found["negative"], &found["nan"]), (&0.into(), &0.into()));
 
     done(&[
         "compare-methods",

@@ -269,10 +269,69 @@ pub struct Image {
     pub pixels: Vec<[f32; 3]>,
 }
 
+/// What [`Image::settle`] had to do.
+#[derive(Clone, Copy, Debug, Default, PartialEq)]
+pub struct Settled {
+    /// Pixels that were below 0.
+    pub pixels: u64,
+    /// How far, in sum over their channels.
+    pub sum: f64,
+}
+
 impl Image {
     /// A black one.
     pub fn new(width: u32, height: u32) -> Self {
         Self { width, height, pixels: vec![[0.0; 3]; width as usize * height as usize] }
+    }
+
+    /// Makes values below 0, which an average of estimates may leave in the dark, 0, and takes what is missing from the
+    /// channel's values around, in proportion to what they hold.
+    ///
+    /// From the least square that holds as much: so the sum over the image stays what it was, and that over a block but for
+    /// what crosses its border, and no value becomes negative. Where the whole image holds less, all of the channel is 0.
+    /// Values that are not finite neither give nor take. The result depends on nothing but the image.
+    pub fn settle(&mut self) -> Settled {
+        let (width, height) = (self.width as usize, self.height as usize);
+        let mut settled = Settled::default();
+        for at in 0..self.pixels.len() {
+            let negative = |value: &f32| *value < 0.0 && value.is_finite();
+            settled.pixels += u64::from(self.pixels[at].iter().any(negative));
+            for channel in 0..3 {
+                let value = self.pixels[at][channel];
+                if !negative(&value) {
+                    continue;
+                }
+                self.pixels[at][channel] = 0.0;
+                settled.sum -= f64::from(value);
+                let (x, y) = (at % width, at / width);
+                let mut radius = 1;
+                loop {
+                    let columns = x.saturating_sub(radius)..(x + radius + 1).min(width);
+                    let rows = y.saturating_sub(radius)..(y + radius + 1).min(height);
+                    let all = columns.len() == width && rows.len() == height;
+                    let places = rows.flat_map(|y| columns.clone().map(move |x| y * width + x));
+                    let gives = |value: f32| value > 0.0 && value.is_finite();
+                    let held: f64 = places
+                        .clone()
+                        .map(|place| self.pixels[place][channel])
+                        .filter(|&value| gives(value))
+                        .map(f64::from)
+                        .sum();
+                    if held >= -f64::from(value) || all {
+                        let keep = (1.0 + f64::from(value) / held).max(0.0);
+                        for place in places {
+                            let value = &mut self.pixels[place][channel];
+                            if gives(*value) {
+                                *value = (f64::from(*value) * keep) as f32;
+                            }
+                        }
+                        break;
+                    }
+                    radius *= 2;
+                }
+            }
+        }
+        settled
     }
 
     /// One whose pixels are computed from column and row.
@@ -344,6 +403,38 @@ mod tests {
         assert!(film.develop().pixels[..7].iter().all(|p| *p == [0.0; 3]));
         assert!(film.standard_error().pixels.iter().all(|p| *p == [0.0; 3]));
         assert_eq!(Film::new(0, 0).passes(), (0, 0));
+    }
+
+    #[test]
+    fn what_is_below_zero_is_taken_from_those_around() {
+        let mut image = Image::new(7, 5);
+        image.pixels[8] = [-1.0, 0.0, f32::NAN];
+        image.pixels[9] = [3.0, 2.0, 1.0];
+        image.pixels[15] = [1.0, 0.0, -f32::INFINITY];
+        image.pixels[34] = [5.0, 0.0, 0.0];
+        assert_eq!(image.settle(), Settled { pixels: 1, sum: 1.0 });
+        assert_eq!(image.pixels[8][0], 0.0);
+        assert_eq!([image.pixels[9], image.pixels[34]], [[2.25, 2.0, 1.0], [5.0, 0.0, 0.0]]);
+        assert_eq!(image.pixels[15][0], 0.75);
+        assert!(image.pixels[8][2].is_nan() && image.pixels[15][2] == -f32::INFINITY);
+        assert_eq!(image.settle(), Settled::default(), "nothing is left to do");
+
+        // What is near holds too little: the square grows.
+        let mut far = Image::new(9, 9);
+        (far.pixels[0], far.pixels[1], far.pixels[80]) = ([-2.0; 3], [0.5; 3], [4.0; 3]);
+        far.settle();
+        let sum: f32 = far.pixels.iter().map(|pixel| pixel[1]).sum();
+        assert!((sum - 2.5).abs() < 1e-6 && far.pixels.iter().all(|pixel| pixel[1] >= 0.0), "{sum}");
+
+        // And where there is too little of it at all, all is black.
+        let mut black = Image::new(2, 1);
+        black.pixels = vec![[-2.0; 3], [1.0; 3]];
+        assert_eq!(black.settle(), Settled { pixels: 1, sum: 6.0 });
+        assert_eq!(black.pixels, [[0.0; 3]; 2]);
+        let mut alone = Image::new(1, 1);
+        alone.pixels[0] = [-1.0; 3];
+        alone.settle();
+        assert_eq!(alone.pixels[0], [0.0; 3]);
     }
 
     #[test]

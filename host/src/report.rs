@@ -38,6 +38,9 @@ pub struct Report {
     /// The boxes inside closed meshes, if they were looked for.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub volumes: Option<VolumeFigures>,
+    /// What was below 0 in the average, and was taken from pixels around, if the method leaves such.
+    #[serde(skip_serializing_if = "Option::is_none")]
+    pub settled: Option<SettledFigures>,
     /// Against the reference, if one was given.
     #[serde(skip_serializing_if = "Option::is_none")]
     pub error: Option<ErrorFigures>,
@@ -162,6 +165,15 @@ impl From<&VolumeStats> for VolumeFigures {
     }
 }
 
+/// What was below 0 in the average.
+#[derive(Clone, Copy, Debug, Default, Serialize)]
+pub struct SettledFigures {
+    /// Pixels.
+    pub pixels: u64,
+    /// What they were short of 0, over the sum of the image.
+    pub part: f64,
+}
+
 /// How far the image is from a reference.
 #[derive(Clone, Copy, Debug, Default, Serialize)]
 pub struct ErrorFigures {
@@ -237,6 +249,12 @@ impl Report {
                 volumes.closed_meshes,
                 100.0 * volumes.fraction,
                 volumes.build_s,
+            );
+        }
+        if let Some(settled) = self.settled.filter(|settled| settled.pixels > 0) {
+            text += &format!(
+                "{} pixels were below 0, by {:.1e} of the image's light in all, which is taken from those around\n",
+                settled.pixels, settled.part
             );
         }
         if let Some(error) = &self.error {

@@ -2,6 +2,7 @@
 
 use rand_xoshiro::Xoshiro128PlusPlus;
 use rand_xoshiro::rand_core::{Rng, SeedableRng};
+use std::sync::LazyLock;
 
 /// How the samples of a light are spread over it. All are unbiased: every single point is uniform.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -72,7 +73,8 @@ impl Sampler {
         match pattern {
             Pattern::Random => points.extend((0..count).map(|_| [self.uniform(), self.uniform()])),
             Pattern::Lattice => {
-                let generator = u64::from(lattice_generator(count as u32));
+                let known = GENERATORS.get(count).copied();
+                let generator = u64::from(known.unwrap_or_else(|| lattice_generator(count as u32)));
                 let shift = [self.word(), self.word()];
                 // i / n as a fraction of 2^32, without a division for each.
                 let step = u64::MAX / count.max(1) as u64;
@@ -122,6 +124,9 @@ impl Sampler {
 }
 
 const BELOW_ONE: f32 = 1.0 - f32::EPSILON / 2.0;
+
+/// [`lattice_generator`] of small numbers: looking for it takes as long as a dozen points.
+static GENERATORS: LazyLock<Vec<u32>> = LazyLock::new(|| (0..=1024).map(lattice_generator).collect());
 
 #[inline]
 fn unit(word: u32) -> f32 {

@@ -10,7 +10,7 @@ use crate::integrator::{
 };
 use crate::photons::BlockerKind;
 use crate::render::{Limits, render, render_adaptively};
-use crate::report::{ErrorFigures, Memory, Report, Times, WorkCounts};
+use crate::report::{ErrorFigures, Memory, Report, SettledFigures, Times, WorkCounts};
 use crate::sampler::Pattern;
 use crate::scene::CameraRequest;
 use crate::volumetric::Volumes;
@@ -38,7 +38,7 @@ pub struct RenderArgs {
     #[arg(long, default_value_t = 16, value_name = "P", value_parser = clap::value_parser!(u32).range(1..))]
     spp: u32,
 
-    /// Shadow rays a camera sample, over all lights together.
+    /// Shadow rays a camera sample, over all lights together; with --method auto about so many on average.
     #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
     shadow_rays: u32,
 
@@ -263,13 +263,13 @@ impl CameraArgs {
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, ValueEnum)]
 enum Method {
     /// Every shadow ray is traced through the scene.
-    #[default]
     Exact,
     /// A random part of the blockers is asked, by a sum over two groups of them: right on average, noisier.
     Stochastic,
     /// Photons say what may be in the way, and only that is traced: quick or slow, and biased.
     Map,
     /// A map learns where shadows begin and end, and rays go there: right on average, and the quickest.
+    #[default]
     Auto,
 }
 
@@ -479,7 +479,9 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     };
     progress.finish();
 
-    let image = rendered.film.develop();
+    let mut image = rendered.film.develop();
+    // Estimates are averaged as they are; the picture that is written holds light.
+    let settled = (args.method == Method::Auto).then(|| image.settle());
     let variance = rendered.film.variance_of_mean();
     for path in &outputs {
         output::write(path, &image, Some(&variance), args.exposure)?;
@@ -524,6 +526,10 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         },
         map: prepared.as_ref().zip(map).map(|(prepared, map)| prepared.figures(map)),
         volumes: volumes.as_ref().map(|volumes| (&volumes.stats).into()),
+        settled: settled.map(|settled| {
+            let sum: f64 = image.pixels.iter().flatten().copied().map(f64::from).sum();
+            SettledFigures { pixels: settled.pixels, part: settled.sum / sum.max(f64::MIN_POSITIVE) }
+        }),
         error,
     };
     if let Some(path) = &args.stats {

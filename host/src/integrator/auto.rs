@@ -9,8 +9,12 @@
 //! the map sleeps, and costs nothing any more.
 //!
 //! Beside the map, each pixel remembers what it saw of each light ([`past`]). That takes the noise out of light that
-//! nothing blocks, shares a point's rays among its lights by their doubt, and among the bins of a light where a border
-//! crosses few of them.
+//! nothing blocks, and shares a point's rays among the bins of a light where a border crosses few of them. And it says how
+//! far each light of each pixel is in doubt: the rays of a pass go to lights and pixels by that, from those that are lit
+//! or dark all around to penumbrae, and by the root of what arrives there at most. Rays in penumbrae take longer, so a
+//! pass has somewhat fewer than it would have without a map.
+//!
+//! Where neither promises anything, in pictures that are penumbra all over and alike, all is left to the exact method.
 
 mod draws;
 mod past;
@@ -25,14 +29,17 @@ use self::past::{Nearby, Past};
 use self::prove::Prove;
 use self::saved::SavedCell;
 use self::seed::Photons;
-use super::{Batch, CameraSample, NOBODY, Questions, Scratch, Stage, Visibility, cast, exact, expect, round};
+use super::{
+    Batch, CameraSample, NOBODY, Questions, Scratch, Share, Stage, Visibility, cast, exact, expect, round,
+    sample_lights,
+};
 use crate::film::Tile;
 use crate::photons::{BlockerSet, Shower};
 use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::dispatch;
 use occlude_kernel::occlusion_map::{
-    BINS, CellKey, Demand, Doubts, Known, MapCell, OcclusionMap, Rates, Tally,
+    BINS, CellKey, Demand, Doubts, Known, LEAST_CHANCE, MapCell, OcclusionMap, Rates, Tally,
 };
 use occlude_kernel::{Counts, Ray, TileScratch, offset};
 use rayon::prelude::*;
@@ -159,7 +166,15 @@ struct Map {
     /// What was known after each lesson.
     history: Vec<Learned>,
     /// By the first column and row of a tile: what its pixels have seen of each light.
-    pasts: HashMap<[u32; 2], Mutex<Vec<Past>>>,
+    pasts: HashMap<[u32; 2], Mutex<TilePast>>,
+    /// What weights are multiplied with, so that a pass takes about as long as usual; none before the first.
+    scale: Option<f32>,
+    /// The most that a light sends, for weights near 1.
+    brightest: f32,
+    /// Is everything left to the exact method?
+    plain: bool,
+    /// Shadow rays of a pixel so far.
+    seen: u64,
     /// Of how many lights there is room for that.
     remembered: usize,
     /// Bytes that are left for cells.
@@ -187,6 +202,10 @@ impl Default for Map {
             full: false,
             history: Vec::new(),
             pasts: HashMap::new(),
+            scale: None,
+            brightest: 1.0,
+            plain: false,
+            seen: 0,
             remembered: 0,
             room: 0,
         }
@@ -218,33 +237,184 @@ const PHOTONS: u64 = 4;
 struct Told {
     /// Whether that is anything.
     changed: bool,
-    /// Samples that lights are due by their doubt.
+    /// Samples that lights are due by their doubt, and these times their doubt.
     sum: f32,
+    squares: f32,
+    /// What the usual samples cost, and those that are due.
+    costs: [f32; 2],
 }
 
-/// A light in doubt gets no more than so many times the samples that its doubt is worth.
+/// What a sample costs where nothing is in doubt, in units of one in a penumbra. Measured: rays there take a tenth to a half
+/// of the time, light samples as long.
+const LEAST_COST: f32 = 0.25;
+
+impl Told {
+    /// Adds a light that would get so many samples, and that is so much in doubt.
+    fn add(&mut self, usual: f32, doubt: f32) {
+        self.changed |= doubt < 1.0;
+        self.sum += usual * doubt;
+        self.squares += usual * doubt * doubt;
+        let cost = doubt.max(LEAST_COST);
+        self.costs[0] += usual * cost;
+        self.costs[1] += usual * doubt * cost;
+    }
+}
+
+/// At a first look a point asks one in so many of its usual rays, of a generator of its own.
+const PILOT: u32 = 2;
+const PILOT_KEY: u64 = 0x510e_527f_ade6_82d1;
+
+/// A light gets no more than so many times the usual number of samples, and by doubt no less than one in so many. Together
+/// with the odds of a cell no part of it gets less than one in [`LEAST_CHANCE`], so no weight is more than that many times
+/// what it would be.
 const MOST_MORE: f32 = 8.0;
 
-fn lock(pasts: &Mutex<Vec<Past>>) -> MutexGuard<'_, Vec<Past>> {
+/// Nor more than this, unless that is usual: what a tile asks is in memory at once.
+const MOST_RAYS: f32 = 2048.0;
+
+/// How much brighter or darker than others a point may count as.
+const BRIGHTNESS: [f32; 2] = [1.0 / 64.0, 8.0];
+
+/// The weight of a point by what arrives there at most: the root, between what is best for the squared error of light,
+/// about the power 0.8, and what is best for that of its logarithm, 0.
+fn brightness(stage: &Stage<'_>, diffuse: Vec3, shares: &[Share], brightest: f32) -> f32 {
+    let sent = |share: &Share| stage.lights[share.light as usize].radiance * share.unshadowed;
+    let arrives = (shares.iter().map(sent).sum::<Vec3>() * diffuse).element_sum() / brightest;
+    // Not a number counts as dark.
+    if arrives.sqrt() > BRIGHTNESS[0] { arrives.sqrt().min(BRIGHTNESS[1]) } else { BRIGHTNESS[0] }
+}
+
+/// What a tile remembers.
+#[derive(Debug, Default)]
+struct TilePast {
+    /// Of each pixel and light, pixel by pixel.
+    pasts: Vec<Past>,
+    /// Of the pass at hand.
+    needs: Needs,
+}
+
+/// What the points of a pass need, in whole numbers, so that sums do not depend on their order.
+#[derive(Clone, Copy, Debug, Default)]
+struct Needs {
+    /// Samples that they would get without a map.
+    usual: u64,
+    /// The same times their weights, which are due to doubt and brightness, and times the squares of these.
+    due: u64,
+    squares: u64,
+    /// What the usual samples cost, and those that are due.
+    costs: [u64; 2],
+    /// What lights send unlike their mean makes of the variance, where they are seen, and what shadows make of it.
+    form: u64,
+    shadow: u64,
+}
+
+/// Rays of a pixel before it is known what it needs.
+const TELLING: u64 = 64;
+
+/// Needs are counted in these parts.
+const NEED: f32 = 4096.0;
+
+/// With less to gain than this, and with less of the variance due to the form of lights, the exact method does as well.
+const WORTH: f64 = 1.1;
+const FORM: f64 = 0.1;
+
+impl Needs {
+    /// Adds a point that would get `usual` samples.
+    fn add(&mut self, usual: u32, told: &Told, bright: f32) {
+        self.usual += u64::from(usual) * NEED as u64;
+        self.due += (told.sum * bright * NEED) as u64;
+        self.squares += (told.squares * bright * bright * NEED) as u64;
+        self.costs[0] += (told.costs[0] * NEED) as u64;
+        self.costs[1] += (told.costs[1] * bright * NEED) as u64;
+    }
+
+    fn merge(&mut self, other: &Self) {
+        self.usual += other.usual;
+        self.due += other.due;
+        self.squares += other.squares;
+        self.costs[0] += other.costs[0];
+        self.costs[1] += other.costs[1];
+        self.form += other.form;
+        self.shadow += other.shadow;
+    }
+
+    /// What to multiply weights with, so that samples cost about as much as usual.
+    fn scale(&self) -> f32 {
+        let [usual, due] = self.costs;
+        if due > 0 { usual as f32 / due as f32 } else { 1.0 }
+    }
+
+    /// Is there anything to gain? With deviations like the weights w, samples in proportion to them have a variance that
+    /// is `mean(w)² / mean(w²)` of that of even ones.
+    fn worth(&self) -> bool {
+        let mean = |sum: u64| sum as f64 / self.usual.max(1) as f64;
+        let form = self.form as f64 / (self.form + self.shadow).max(1) as f64;
+        mean(self.squares) > WORTH * mean(self.due).powi(2) || form > FORM
+    }
+}
+
+fn lock(pasts: &Mutex<TilePast>) -> MutexGuard<'_, TilePast> {
     pasts.lock().unwrap_or_else(|poisoned| poisoned.into_inner())
 }
 
 /// What a pixel of a tile has seen of a light; of so many lights there is something to remember.
 #[inline(always)]
 fn past_of<'a>(
-    pasts: &'a mut Option<MutexGuard<'_, Vec<Past>>>,
+    pasts: &'a mut Option<MutexGuard<'_, TilePast>>,
     pixel: u32,
     light: u32,
     lights: usize,
 ) -> Option<&'a mut Past> {
     let light = Some(light as usize).filter(|&light| light < lights)?;
-    pasts.as_mut()?.get_mut(pixel as usize * lights + light)
+    pasts.as_mut()?.pasts.get_mut(pixel as usize * lights + light)
 }
 
 impl Map {
     /// What the pixels of a tile have seen.
-    fn pasts_of(&self, place: [u32; 2]) -> Option<MutexGuard<'_, Vec<Past>>> {
+    fn pasts_of(&self, place: [u32; 2]) -> Option<MutexGuard<'_, TilePast>> {
         self.pasts.get(&place).map(lock)
+    }
+
+    /// Asks some rays at the points of a first look, so that pixels know about what they will see: those in between what
+    /// these saw that are next to them. Says what the points need.
+    ///
+    /// What these rays saw is no part of the picture, and their random numbers are their own.
+    fn pilot(&self, stage: &Stage<'_>, scratch: &mut Scratch) -> Needs {
+        let mut needs = Needs::default();
+        let rays = stage.shadow_rays / PILOT;
+        let Some(mut pasts) = self.pasts_of(scratch.questions.place).filter(|_| rays >= FEW / 2) else {
+            return needs;
+        };
+        for sampler in &mut scratch.samplers {
+            *sampler = Sampler::from_key(sampler.key() ^ PILOT_KEY);
+        }
+        sample_lights(&Stage { shadow_rays: rays, count: false, ..*stage }, scratch);
+        let Scratch { questions, estimates, shares, .. } = scratch;
+        exact::trace(&Stage { count: false, ..*stage }, &[], questions, estimates, &mut Counts::default());
+        let lights = self.remembered;
+        let pasts = &mut pasts.pasts;
+        for batch in questions.batches.iter().filter(|batch| (batch.light as usize) < lights) {
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let estimates = &estimates[samples.clone()];
+            let [all, free] = past::sums(&questions.weights[samples], estimates);
+            let pixel = questions.points[batch.point as usize].pixel as usize;
+            if let Some(past) = pasts.get_mut(pixel * lights + batch.light as usize) {
+                past.foresee((free / all).min(1.0), 1.0 / PILOT as f32);
+            }
+        }
+        past::spread(pasts, questions.width as usize, lights);
+        for point in &questions.points {
+            expect(stage, point, shares);
+            let mut told = Told::default();
+            for share in shares.iter() {
+                let light = share.light as usize;
+                let near = Nearby::new(pasts, questions.width, point.pixel, light, lights);
+                told.add(share.expected, near.map_or(1.0, |near| near.doubt(share.expected)));
+            }
+            let bright = brightness(stage, point.diffuse, shares, self.brightest);
+            needs.add(stage.shadow_rays, &told, bright);
+        }
+        needs
     }
 
     fn view(&self) -> OcclusionMap<'_> {
@@ -540,7 +710,7 @@ impl Auto {
     /// Bytes that the map takes.
     pub fn bytes(&self) -> usize {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
-        let pixels: usize = map.pasts.values().map(|pasts| lock(pasts).len()).sum();
+        let pixels: usize = map.pasts.values().map(|pasts| lock(pasts).pasts.len()).sum();
         bytes_of(map.cells.len()) + pixels * size_of::<Past>()
     }
 
@@ -628,12 +798,15 @@ impl Visibility for Auto {
         let beside = stage.camera.ray_direction(0.5 * width as f32 + 1.0, 0.5 * width as f32);
         let most_strays = self.options.memory / size_of::<Stray>() / tiles.len().max(1);
         *map = Map { angle: (beside - ahead).length() / ahead.length(), most_strays, ..Map::default() };
+        let sent = stage.lights.iter().map(|light| light.radiance.element_sum()).fold(0.0, f32::max);
+        map.brightest = if sent > 0.0 && sent.is_finite() { sent } else { 1.0 };
         // Half of the memory is for the cells at least.
         let each = tiles.iter().map(|tile| tile.len()).sum::<usize>().max(1) * size_of::<Past>();
         map.remembered = (self.options.memory / 2 / each).min(stage.lights.len());
         map.room = self.options.memory - map.remembered * each;
         if map.remembered > 0 {
-            let pasts = |tile: &Tile| vec![Past::default(); tile.len() * map.remembered];
+            let each = |tile: &Tile| vec![Past::default(); tile.len() * map.remembered];
+            let pasts = |tile: &Tile| TilePast { pasts: each(tile), needs: Needs::default() };
             map.pasts = tiles.iter().map(|tile| ([tile.x, tile.y], Mutex::new(pasts(tile)))).collect();
         }
         if let Some(before) = &self.before {
@@ -641,7 +814,7 @@ impl Visibility for Auto {
         }
         let found = &*map;
         // A look at every other pixel of every other row finds nearly all cells there are.
-        let looks: Vec<(Vec<Stray>, usize)> = tiles
+        let looks: Vec<(Vec<Stray>, usize, Needs)> = tiles
             .par_iter()
             .map_init(Scratch::default, |scratch, &tile| {
                 scratch.paths.clear();
@@ -666,9 +839,13 @@ impl Visibility for Auto {
                     }
                 }
                 strays.truncate(most_strays);
-                (strays, scratch.questions.points.len())
+                let points = scratch.questions.points.len();
+                (strays, points, found.pilot(stage, scratch))
             })
             .collect();
+        let mut needs = Needs::default();
+        looks.iter().for_each(|look| needs.merge(&look.2));
+        map.scale = (needs.usual > 0).then(|| needs.scale());
         let points: usize = looks.iter().map(|look| look.1).sum();
         let strays: Vec<Stray> = looks.into_iter().flat_map(|look| look.0).collect();
         map.samples = f64::from(stage.shadow_rays) * points as f64 / strays.len().max(1) as f64;
@@ -682,6 +859,10 @@ impl Visibility for Auto {
 
     fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if map.plain {
+            drop(map);
+            return sample_lights(stage, scratch);
+        }
         let view = map.view();
         let Scratch { samplers, questions, shares, square, fan, radiance, .. } = scratch;
         let mut pasts = map.pasts_of(questions.place);
@@ -691,6 +872,10 @@ impl Visibility for Auto {
         let mut found: Vec<Option<Option<usize>>> = vec![None; stage.lights.len()];
         let mut known: Vec<(Known, Option<usize>)> = Vec::new();
         let mut nearby: Vec<Option<Nearby>> = Vec::new();
+        // Cells that are found late are of little use.
+        let noting = (map.passes + 1).is_power_of_two();
+        let mut needs = Needs::default();
+        let mut usual: Vec<f32> = Vec::new();
         for index in 0..questions.points.len() {
             let point = questions.points[index];
             let sampler = &mut samplers[point.path as usize];
@@ -698,6 +883,8 @@ impl Visibility for Auto {
             known.clear();
             nearby.clear();
             let mut told = Told::default();
+            usual.clear();
+            usual.extend(shares.iter().map(|share| share.expected));
             if map.asleep {
                 known.resize(shares.len(), (Known::All, None));
             } else {
@@ -720,7 +907,8 @@ impl Visibility for Auto {
                     if thought == Known::Lit {
                         continue;
                     }
-                    let outside = cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
+                    let outside =
+                        noting && cell.is_none_or(|cell| view.cells()[cell].is_lit() && map.tries[cell] > 0);
                     if outside && !(map.full && cell.is_none()) && strays.len() < map.most_strays {
                         let stray = |key| Stray { key, origin: point.origin, normal: point.normal };
                         strays.extend(key().map(stray));
@@ -734,17 +922,23 @@ impl Visibility for Auto {
                 if *thought == Known::Lit {
                     nearby.push(None);
                     told.changed = true;
+                    told.costs[0] += share.expected * LEAST_COST;
                     share.expected = 0.0;
                     continue;
                 }
                 let near = pasts.as_ref().and_then(|pasts| {
-                    Nearby::new(pasts, questions.width, point.pixel, share.light as usize, map.remembered)
+                    Nearby::new(
+                        &pasts.pasts,
+                        questions.width,
+                        point.pixel,
+                        share.light as usize,
+                        map.remembered,
+                    )
                 });
                 nearby.push(near);
                 let doubt = near.map_or(1.0, |near| near.doubt(share.expected));
-                told.changed |= doubt < 1.0;
+                told.add(share.expected, doubt);
                 share.expected *= doubt;
-                told.sum += share.expected;
                 // What a cell thinks of a border only adds noise to a pixel that has none; and of one that has not been
                 // asked, its first samples tell more.
                 let bordered = cell.is_some_and(|cell| !view.cells()[cell].is_flat());
@@ -754,13 +948,25 @@ impl Visibility for Auto {
                     *thought = Known::Nothing;
                 }
             }
-            if told.changed && told.sum > 0.0 {
-                let scale = (stage.shadow_rays as f32 / told.sum).min(MOST_MORE);
-                shares.iter_mut().for_each(|share| share.expected *= scale);
+            let bright = brightness(stage, point.diffuse, shares, map.brightest);
+            needs.add(stage.shadow_rays, &told, bright);
+            if let Some(scale) = map.scale {
+                told.changed = true;
+                for (share, usual) in shares.iter_mut().zip(&*usual) {
+                    let due = share.expected * (scale * bright);
+                    share.expected = if share.expected > 0.0 {
+                        due.clamp(usual * (1.0 / MOST_MORE), (usual * MOST_MORE).min(usual.max(MOST_RAYS)))
+                    } else {
+                        0.0
+                    };
+                }
             }
-            for (share, (thought, cell)) in shares.iter_mut().zip(&known) {
+            for ((share, (thought, cell)), usual) in shares.iter_mut().zip(&known).zip(&*usual) {
                 if let (Known::Odds, Some(cell)) = (thought, cell) {
-                    share.expected *= view.cells()[*cell].part();
+                    let cell = &view.cells()[*cell];
+                    // With odds that differ a bin may have the least chance already.
+                    let least = if cell.is_flat() { 1.0 / LEAST_CHANCE as f32 } else { cell.part() };
+                    share.expected = (share.expected * cell.part()).max(usual * least);
                     told.changed = true;
                 }
             }
@@ -830,6 +1036,9 @@ impl Visibility for Auto {
                 }
             }
         }
+        if let Some(pasts) = &mut pasts {
+            pasts.needs.merge(&needs);
+        }
         if !strays.is_empty() {
             self.strays.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).append(&mut strays);
         }
@@ -844,6 +1053,9 @@ impl Visibility for Auto {
     ) {
         exact::trace(stage, &[], questions, estimates, counts);
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if map.plain {
+            return;
+        }
         let mut doubts = Doubts::default();
         for (batch, &index) in questions.batches.iter().zip(&questions.cells) {
             let Some(cell) = map.cells.get(index as usize) else { continue };
@@ -858,6 +1070,7 @@ impl Visibility for Auto {
             }
         }
         let mut pasts = map.pasts_of(questions.place);
+        let (mut form, mut shadow) = (0.0f64, 0.0f64);
         for (batch, &whole) in questions.batches.iter().zip(&questions.wholes) {
             let pixel = questions.points[batch.point as usize].pixel;
             if whole.is_nan() {
@@ -865,6 +1078,7 @@ impl Visibility for Auto {
             }
             let Some(past) = past_of(&mut pasts, pixel, batch.light, map.remembered) else { continue };
             let samples = batch.samples.start as usize..batch.samples.end as usize;
+            let count = samples.len() as f32;
             let estimates = &mut estimates[samples.clone()];
             let [all, free] = past::sums(&questions.weights[samples], estimates);
             let off = if whole.is_finite() { whole - all } else { 0.0 };
@@ -874,10 +1088,16 @@ impl Visibility for Auto {
                 &questions.bins[batch.samples.start as usize..batch.samples.end as usize],
                 estimates,
             );
+            form += f64::from((v * off / all).powi(2));
+            shadow += f64::from(v * (1.0 - v) / (count * count.sqrt()));
             let more = past.asked(v, off) / all;
             if more != 0.0 {
                 estimates.iter_mut().for_each(|estimate| *estimate += more);
             }
+        }
+        if let Some(pasts) = &mut pasts {
+            pasts.needs.form += (form * f64::from(NEED)) as u64;
+            pasts.needs.shadow += (shadow * f64::from(NEED)) as u64;
         }
         if doubts != Doubts::default() {
             self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
@@ -886,7 +1106,18 @@ impl Visibility for Auto {
 
     fn passed(&self, stage: &Stage<'_>) {
         let mut map = self.map.write().unwrap_or_else(|poisoned| poisoned.into_inner());
+        if map.plain {
+            return;
+        }
+        let mut needs = Needs::default();
+        for tile in map.pasts.values_mut() {
+            let tile = tile.get_mut().unwrap_or_else(|poisoned| poisoned.into_inner());
+            needs.merge(&std::mem::take(&mut tile.needs));
+        }
+        map.scale = (map.remembered > 0).then(|| needs.scale());
+        map.seen += u64::from(stage.shadow_rays);
         if map.asleep {
+            map.plain = !self.restless && (map.remembered == 0 || map.seen >= TELLING && !needs.worth());
             return;
         }
         let strays =
@@ -898,7 +1129,9 @@ impl Visibility for Auto {
         let doubts =
             std::mem::take(&mut *self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()));
         map.doubts.merge(&doubts);
-        map.prove(stage);
+        if map.passes.is_power_of_two() {
+            map.prove(stage);
+        }
         if worth_learning(map.passes) {
             map.learn();
             map.asleep &= !self.restless;
@@ -910,4 +1143,38 @@ impl Visibility for Auto {
 fn worth_learning(passes: u32) -> bool {
     let odd = passes >> passes.trailing_zeros();
     odd == 1 || odd == 3
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn needs_scale_to_the_usual_number_and_tell_whether_weights_help() {
+        let needs = |weights: [f32; 2]| {
+            let mut needs = Needs::default();
+            for &doubt in &weights {
+                let mut told = Told::default();
+                told.add(16.0, doubt);
+                needs.add(16, &told, 1.0);
+            }
+            needs
+        };
+        let unlike = needs([1.0, 0.25]);
+        // 16 + 16 / 4 over 16 + 16 / 16.
+        assert_eq!(unlike.scale(), 20.0 / 17.0);
+        assert!(unlike.worth());
+        let mut alike = needs([0.5, 0.5]);
+        assert_eq!(alike.scale(), 2.0);
+        assert!(!alike.worth());
+        (alike.form, alike.shadow) = (1, 10);
+        assert!(!alike.worth(), "9 % of the variance");
+        alike.form = 2;
+        assert!(alike.worth());
+        assert_eq!(Needs::default().scale(), 1.0);
+        assert!(!Needs::default().worth());
+        let mut both = needs([1.0, 1.0]);
+        both.merge(&needs([0.25, 0.25]));
+        assert_eq!(both.scale(), unlike.scale());
+    }
 }

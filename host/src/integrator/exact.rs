@@ -1,8 +1,9 @@
 //! Every shadow ray traced: the answers are right, one by one.
 
-use super::{Questions, Stage, Visibility};
+use super::{Questions, Scratch, Stage, Visibility, sample_lights};
 use crate::film::z_order;
 use crate::light::AreaLight;
+use crate::sampler::Sampler;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::{Bvh, Counter, Counts, Occluders, Simd, Targets, TilePoint, TileScratch, Uncounted};
 
@@ -11,6 +12,29 @@ use occlude_kernel::{Bvh, Counter, Counts, Occluders, Simd, Targets, TilePoint, 
 pub struct Exact;
 
 impl Visibility for Exact {
+    fn estimate(
+        &self,
+        stage: &Stage<'_>,
+        questions: &Questions,
+        estimates: &mut Vec<f32>,
+        counts: &mut Counts,
+    ) {
+        trace(stage, &[], questions, estimates, counts);
+    }
+}
+
+/// As [`Exact`], at the same points, with other random numbers for the lights: of each key other ones.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Anew(pub u64);
+
+impl Visibility for Anew {
+    fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
+        for sampler in &mut scratch.samplers {
+            *sampler = Sampler::from_key(sampler.key() ^ self.0);
+        }
+        sample_lights(stage, scratch);
+    }
+
     fn estimate(
         &self,
         stage: &Stage<'_>,

@@ -9,7 +9,7 @@ mod map;
 mod stochastic;
 
 pub use auto::{Auto, AutoOptions, Learned, SavedMap, fingerprint};
-pub use exact::{Exact, Walled};
+pub use exact::{Anew, Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
