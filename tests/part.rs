@@ -3,10 +3,9 @@
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::generate::{Kind, generate};
-use occlude_kernel::bvh::Leaf;
 use occlude_kernel::lanes::{Task, detect, dispatch, levels};
 use occlude_kernel::{
-    BatchScratch, Bvh, Child, Counts, Part, Ray, Scalar, Simd, Targets, TriangleBlock, Uncounted,
+    BatchScratch, Bvh, Child, Counts, Leaf, Part, Ray, Scalar, Simd, Targets, TriangleBlock, Uncounted,
 };
 use occlude_tests::Random;
 

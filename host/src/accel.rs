@@ -58,7 +58,7 @@ const NODE_COST: f32 = 1.0;
 const BLOCK_COST: f32 = 1.0;
 
 impl Accel {
-    /// Triangles a tree can surely name: blocks are at least half full, and a leaf can name 2^25 of them.
+    /// Triangles a tree can surely name: blocks are more than half full, and leaves can name nearly 2^25 of them.
     pub const MOST_TRIANGLES: usize = 1 << 27;
 
     /// Builds the tree of a scene's triangles; triangle `i` keeps the number `i`.
@@ -80,14 +80,7 @@ impl Accel {
         let Some(binary) = build_binary(&boxes, quality) else {
             return Self::evenly(triangles, &boxes);
         };
-        let mut cutter = Cutter {
-            plan: plan(&binary),
-            binary: &binary,
-            triangles,
-            nodes: Vec::with_capacity(triangles.len() / 20 + 1),
-            blocks: Vec::with_capacity(triangles.len() / 7 + 1),
-            room: Default::default(),
-        };
+        let mut cutter = Cutter::new(&binary, triangles);
         cutter.root();
         let (nodes, blocks) = (cutter.nodes, cutter.blocks);
         Self { nodes, blocks, triangles: triangles.len() }
@@ -108,14 +101,7 @@ impl Accel {
         order.sort_unstable();
         let order: Vec<u32> = order.into_iter().map(|(_, i)| i).collect();
         let binary = Bvh2::default();
-        let mut cutter = Cutter {
-            plan: Vec::new(),
-            binary: &binary,
-            triangles,
-            nodes: Vec::new(),
-            blocks: Vec::new(),
-            room: Default::default(),
-        };
+        let mut cutter = Cutter::new(&binary, triangles);
         let parts: Vec<&[u32]> =
             order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
         cutter.place(1, parts.len(), |cutter, part| cutter.even(parts[part], 2));
@@ -321,7 +307,19 @@ struct Cutter<'a> {
     room: [Vec<usize>; TriangleBlock::WIDTH],
 }
 
-impl Cutter<'_> {
+impl<'a> Cutter<'a> {
+    /// With nothing written yet.
+    fn new(binary: &'a Bvh2, triangles: &'a [[Vec3; 3]]) -> Self {
+        Self {
+            plan: plan(binary),
+            binary,
+            triangles,
+            nodes: Vec::with_capacity(triangles.len() / 20 + 1),
+            blocks: Vec::with_capacity(triangles.len() / 7 + 1),
+            room: Default::default(),
+        }
+    }
+
     fn root(&mut self) {
         // A root that is a block still needs a node above it.
         if self.binary.nodes[0].is_leaf() || self.plan[0].own == 0 {

@@ -37,8 +37,8 @@ pub mod triangle;
 mod vec3x;
 
 pub use bvh::{
-    BatchScratch, Bvh, BvhError, Child, HitPacket, Node, Occluders, Part, Targets, TilePoint, TileScratch,
-    offset,
+    BatchScratch, Bvh, BvhError, Child, HitPacket, Leaf, Node, Occluders, Part, Targets, TilePoint,
+    TileScratch, offset,
 };
 pub use counter::{Counter, Counts, Uncounted};
 pub use decomposition::{Costs, Decomposition, EstimatorError, Group, Joint, Need, Needs, Tally};

@@ -385,9 +385,7 @@ impl Map {
         let Some(mut pasts) = self.pasts_of(scratch.questions.place).filter(|_| rays >= FEW / 2) else {
             return needs;
         };
-        for sampler in &mut scratch.samplers {
-            *sampler = Sampler::from_key(sampler.key() ^ PILOT_KEY);
-        }
+        scratch.draw_anew(PILOT_KEY);
         sample_lights(&Stage { shadow_rays: rays, count: false, ..*stage }, scratch);
         let Scratch { questions, estimates, shares, .. } = scratch;
         exact::trace(&Stage { count: false, ..*stage }, &[], questions, estimates, &mut Counts::default());
@@ -1150,7 +1148,7 @@ mod tests {
     use super::*;
 
     #[test]
-    fn needs_scale_to_the_usual_number_and_tell_whether_weights_help() {
+    fn needs_scale_to_the_usual_cost_and_tell_whether_weights_help() {
         let needs = |weights: [f32; 2]| {
             let mut needs = Needs::default();
             for &doubt in &weights {
@@ -1161,7 +1159,7 @@ mod tests {
             needs
         };
         let unlike = needs([1.0, 0.25]);
-        // 16 + 16 / 4 over 16 + 16 / 16.
+        // The usual samples cost 16 + 16 / 4, those that are due 16 + (16 / 4) / 4.
         assert_eq!(unlike.scale(), 20.0 / 17.0);
         assert!(unlike.worth());
         let mut alike = needs([0.5, 0.5]);

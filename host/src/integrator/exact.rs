@@ -3,7 +3,6 @@
 use super::{Questions, Scratch, Stage, Visibility, sample_lights};
 use crate::film::z_order;
 use crate::light::AreaLight;
-use crate::sampler::Sampler;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::{Bvh, Counter, Counts, Occluders, Simd, Targets, TilePoint, TileScratch, Uncounted};
 
@@ -29,9 +28,7 @@ pub struct Anew(pub u64);
 
 impl Visibility for Anew {
     fn ask(&self, stage: &Stage<'_>, scratch: &mut Scratch) {
-        for sampler in &mut scratch.samplers {
-            *sampler = Sampler::from_key(sampler.key() ^ self.0);
-        }
+        scratch.draw_anew(self.0);
         sample_lights(stage, scratch);
     }
 
@@ -42,7 +39,7 @@ impl Visibility for Anew {
         estimates: &mut Vec<f32>,
         counts: &mut Counts,
     ) {
-        trace(stage, &[], questions, estimates, counts);
+        Exact.estimate(stage, questions, estimates, counts);
     }
 }
 

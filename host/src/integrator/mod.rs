@@ -225,6 +225,15 @@ pub struct Scratch {
     pub shadow_counts: Counts,
 }
 
+impl Scratch {
+    /// From here on the points' random numbers are others than they would have been: of each key other ones.
+    fn draw_anew(&mut self, key: u64) {
+        for sampler in &mut self.samplers {
+            *sampler = Sampler::from_key(sampler.key() ^ key);
+        }
+    }
+}
+
 /// Renders one camera sample of every pixel of a tile and adds it to the film.
 pub fn render_tile(
     stage: &Stage<'_>,

@@ -764,8 +764,8 @@ impl<S: Simd> Bvh<'_, S> {
         self.gather(&shaft, root, rays, points.len(), cut, given, counter) && given.count == 0
     }
 
-    /// The shaft around a tile's segments; `None` where it would say nothing. `whole` are the first and the last target of
-    /// all points, if they follow each other.
+    /// The shaft around a tile's segments; `None` where it would say nothing. `whole` is where the targets of all points
+    /// begin and end, if they follow each other.
     #[inline(always)]
     fn shaft(
         &self,

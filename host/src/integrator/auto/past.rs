@@ -266,7 +266,8 @@ mod tests {
                 most = most.max(total.abs());
             }
             assert!((sum / cases as f32).abs() < 1e-6, "{passes} passes: {sum}");
-            assert!(most > if passes < 2 && foreseen == 0.0 { -1.0 } else { 0.1 }, "{passes} passes: {most}");
+            // Of one pass with nothing foreseen there is nothing to take out.
+            assert!(most > 0.1 || passes < 2 && foreseen == 0.0, "{passes} passes: {most}");
         }
     }
 

@@ -8,8 +8,7 @@ use crate::error::{Error, Result};
 use crate::sampler::Sampler;
 use crate::scene::Scene;
 use glam::Vec3;
-use occlude_kernel::bvh::Leaf;
-use occlude_kernel::{Bvh, Child, NO_TRIANGLE, Node, Part, TriangleBlock};
+use occlude_kernel::{Bvh, Child, Leaf, NO_TRIANGLE, Node, Part, TriangleBlock};
 
 /// How blockers are divided into groups.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
