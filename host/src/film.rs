@@ -122,11 +122,52 @@ impl Accumulator {
     }
 }
 
+/// What the shadow rays of a pixel's samples were like, in sums over batches. Light is squared, in sum over channels.
+#[derive(Clone, Copy, Debug, Default)]
+pub struct Heard {
+    /// Shadow rays.
+    pub rays: f32,
+    /// Light that arrived: all of it, and that of batches of more than one ray.
+    pub all: f32,
+    /// See there.
+    pub known: f32,
+    /// The variance that rays made in those, times the power 1.5 of the rays of the sample.
+    pub noise: f32,
+    /// All of the light times the rays of the sample, over those of the batch.
+    pub each: f32,
+}
+
+impl Heard {
+    /// A batch of so many rays, of a sample that was due `due`. Of radiance 1 it saw `seen`, with a variance over `rays`
+    /// *independent* rays of `variance`; `full` is radiance times reflectance, squared.
+    #[inline]
+    pub fn batch(rays: usize, due: u32, full: f32, seen: f32, variance: f32) -> Self {
+        let (n, due) = (rays as f32, due as f32);
+        let all = full * seen * seen;
+        // Spread rays make less, by the root of their number.
+        let (known, noise) =
+            if rays > 1 { (all, full * variance.max(0.0) * due * (due / n).sqrt()) } else { (0.0, 0.0) };
+        Self { rays: n, all, known, noise, each: all * due / n }
+    }
+}
+
+impl std::ops::AddAssign for Heard {
+    fn add_assign(&mut self, other: Self) {
+        self.rays += other.rays;
+        self.all += other.all;
+        self.known += other.known;
+        self.noise += other.noise;
+        self.each += other.each;
+    }
+}
+
 /// The pixels of one tile.
 #[derive(Clone, Debug)]
 pub struct TileFilm {
     tile: Tile,
     pixels: Vec<Accumulator>,
+    /// Of each pixel, if asked for.
+    heard: Vec<Heard>,
 }
 
 impl TileFilm {
@@ -142,6 +183,36 @@ impl TileFilm {
     #[inline]
     pub fn add(&mut self, pixel: usize, radiance: Vec3) {
         self.pixels[pixel].add(radiance.as_dvec3());
+    }
+
+    /// Whether it was [made](Film::listening) to hear what shadow rays are like.
+    pub fn listens(&self) -> bool {
+        !self.heard.is_empty()
+    }
+
+    /// Adds what a batch of a pixel was like.
+    ///
+    /// # Panics
+    /// If the tile has no such pixel or does not listen.
+    #[inline]
+    pub fn hear(&mut self, pixel: usize, batch: Heard) {
+        self.heard[pixel] += batch;
+    }
+
+    /// What was heard of a pixel.
+    ///
+    /// # Panics
+    /// If the tile has no such pixel or does not listen.
+    pub fn heard(&self, pixel: usize) -> &Heard {
+        &self.heard[pixel]
+    }
+
+    /// The mean of a pixel's samples, and the sum of their squared distances from it over all channels.
+    ///
+    /// # Panics
+    /// If the tile has no such pixel.
+    pub fn spread(&self, pixel: usize) -> (DVec3, f64) {
+        (self.pixels[pixel].mean, self.pixels[pixel].deviation.element_sum())
     }
 
     /// How many passes a pixel has had.
@@ -177,9 +248,21 @@ impl Film {
     /// The same in tiles of another edge. What it develops to does not depend on the edge.
     pub fn with_tiles(width: u32, height: u32, edge: u32) -> Self {
         let tiles = Tile::cover(width, height, edge)
-            .map(|tile| TileFilm { tile, pixels: vec![Accumulator::default(); tile.len()] })
+            .map(|tile| TileFilm {
+                tile,
+                pixels: vec![Accumulator::default(); tile.len()],
+                heard: Vec::new(),
+            })
             .collect();
         Self { width, height, tiles }
+    }
+
+    /// The same that listens to what the shadow rays of each pixel are like: 20 bytes a pixel more.
+    pub fn listening(mut self) -> Self {
+        for tile in &mut self.tiles {
+            tile.heard = vec![Heard::default(); tile.pixels.len()];
+        }
+        self
     }
 
     /// Becomes the mean of itself and another film of the same size and tiles, weighted. Pixels that had nothing in
@@ -193,11 +276,6 @@ impl Film {
                 pixel.merge(own, other, weight);
             }
         }
-    }
-
-    /// The variance of one sample of each pixel, as far as is known.
-    pub fn variance_of_sample(&self) -> Image {
-        self.image(Accumulator::variance_of_sample)
     }
 
     /// Pixels across.
@@ -247,7 +325,7 @@ impl Film {
 
     fn image(&self, value: impl Fn(&Accumulator) -> DVec3) -> Image {
         let mut image = Image::new(self.width, self.height);
-        for TileFilm { tile, pixels } in &self.tiles {
+        for TileFilm { tile, pixels, .. } in &self.tiles {
             for (i, pixel) in pixels.iter().enumerate() {
                 let (x, y) = tile.position(i);
                 image.pixels[y as usize * self.width as usize + x as usize] =

@@ -1,6 +1,7 @@
 //! Renders the direct light of area lights with the `occlude` kernel.
 
 pub mod accel;
+mod adaptive;
 pub mod cli;
 pub mod clock;
 pub mod compare_methods;

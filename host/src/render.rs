@@ -1,7 +1,8 @@
 //! Every pixel, pass by pass.
 
-use crate::film::{Film, Tile, TileFilm};
-use crate::integrator::{CameraSample, Scratch, Stage, StageTimes, Visibility, render_samples, render_tile};
+use crate::adaptive::{Due, FEWEST, FIRST, FIRST_WEIGHT, Needs, first_rays};
+use crate::film::{Film, TileFilm};
+use crate::integrator::{CameraSample, Scratch, Stage, StageTimes, Visibility, render_samples};
 use occlude_kernel::Counts;
 use rayon::prelude::*;
 use std::sync::Mutex;
@@ -52,12 +53,16 @@ pub fn render(
     run(stage, method, size, limits, threads, stop, false, passed)
 }
 
-/// The same with as many camera samples in all, but more of them where the picture is not sure yet.
+/// The same for about the same work, but with camera samples where the picture is not sure yet, and with no more shadow
+/// rays for each than help there.
 ///
-/// In rounds: after a few passes over everything, each round has as many samples a pixel, on average, as all before it,
-/// and a pixel gets them in proportion to the standard deviation that was seen in it and around it; at least one, and at
-/// most 16 times the average. Right on average: how many samples a pixel gets follows from earlier rounds only, and a
-/// round counts by its number of passes, whatever was seen in it.
+/// In rounds: after four passes over everything, with a quarter of the shadow rays, each round costs as much as all passes
+/// before it. What it gives a pixel follows from the variance that was seen in it and around it, and from what part of that
+/// shadow rays made: at least one sample and at most 64 for each pass, of the usual number of shadow rays or of that halved
+/// some times. With fewer than eight passes, and until the first four are done, it is [`render`].
+///
+/// Right on average: what a pixel gets follows from earlier rounds only, and a round counts by its number of passes, the
+/// first one for a twentieth of that, whatever was seen in it.
 pub fn render_adaptively(
     stage: &Stage<'_>,
     method: &dyn Visibility,
@@ -70,43 +75,15 @@ pub fn render_adaptively(
     run(stage, method, size, limits, threads, stop, true, passed)
 }
 
-/// Passes over everything before samples are given where they are needed.
-const FIRST: u32 = 4;
-
-/// Times the average that a pixel can get at most.
-const MOST: f32 = 16.0;
-
-/// How many samples the pixels of each tile get in a round of so many passes.
-fn shares(film: &Film, passes: u32) -> Vec<Vec<u32>> {
-    let variance = film.variance_of_sample();
-    let (width, height) = (film.width() as usize, film.height() as usize);
-    let at = |x: usize, y: usize| variance.pixels[y * width + x].iter().sum::<f32>();
-    let deviation: Vec<f32> = (0..height)
-        .into_par_iter()
-        .flat_map_iter(|y| {
-            (0..width).map(move |x| {
-                let rows = y.saturating_sub(1)..(y + 2).min(height);
-                let columns = x.saturating_sub(1)..(x + 2).min(width);
-                let around: f32 = rows
-                    .clone()
-                    .flat_map(|y| columns.clone().map(move |x| (x, y)))
-                    .map(|(x, y)| at(x, y))
-                    .sum();
-                (around / (rows.len() * columns.len()) as f32).sqrt()
-            })
-        })
-        .collect();
-    let mean = deviation.iter().map(|&d| f64::from(d)).sum::<f64>() / deviation.len().max(1) as f64;
-    let scale = if mean > 0.0 { f64::from(passes) / mean } else { 0.0 };
-    let share = |x: u32, y: u32| {
-        let due = f64::from(deviation[y as usize * width + x as usize]) * scale;
-        // A tenth is for all alike, so that nothing is forgotten.
-        let due = 0.9 * due as f32 + 0.1 * passes as f32;
-        (due.round() as u32).clamp(1, (MOST * passes as f32) as u32)
-    };
-    let of_tile =
-        |tile: Tile| (0..tile.len()).map(|pixel| tile.position(pixel)).map(|(x, y)| share(x, y)).collect();
-    film.tiles().iter().map(|tile| of_tile(tile.tile())).collect()
+/// A round under way.
+struct Round {
+    film: Film,
+    /// What the pixels of each tile get.
+    due: Vec<Vec<Due>>,
+    /// Its first pass.
+    first: u32,
+    /// And how many it has.
+    passes: u32,
 }
 
 #[allow(clippy::too_many_arguments)]
@@ -124,27 +101,39 @@ fn run(
         .num_threads(threads)
         .build()
         .map_err(|error| crate::Error::Usage(format!("cannot start {threads} threads: {error}")))?;
-    let mut film = Film::new(size.0, size.1);
+    let adaptive = adaptive && limits.passes >= FEWEST;
+    let new_film = || {
+        let film = Film::new(size.0, size.1);
+        if adaptive { film.listening() } else { film }
+    };
+    let mut film = new_film();
     let scratches: Vec<Mutex<Scratch>> = (0..pool.current_num_threads()).map(|_| Mutex::default()).collect();
     let start = Instant::now();
     let mut passes = 0;
     let out_of_time = || limits.time.is_some_and(|most| start.elapsed() >= most);
+    let even_rays = if adaptive { first_rays(stage.shadow_rays) } else { stage.shadow_rays };
     pool.install(|| {
         let tiles: Vec<_> = film.tiles().iter().map(TileFilm::tile).collect();
         method.begin(stage, &tiles, size.0);
-        // Of the round at hand: its film, the samples of its pixels, its first pass and how many it has.
-        let mut round: Option<(Film, Vec<Vec<u32>>, u32, u32)> = None;
-        let mut had: Vec<Vec<u32>> = tiles.iter().map(|tile| vec![0; tile.len()]).collect();
+        let mut needs = if adaptive { Needs::new(size.0, size.1) } else { Needs::new(0, 0) };
+        let mut had: Vec<Vec<u32>> = tiles.iter().map(|tile| vec![FIRST; tile.len()]).collect();
+        // What the film counts.
+        let mut weight = 0.0;
+        let mut round: Option<Round> = None;
         while passes < limits.passes && !stop.load(Ordering::Relaxed) && !(passes > 0 && out_of_time()) {
             if adaptive && passes >= FIRST && round.is_none() {
-                let count = passes.min(limits.passes - passes);
                 if passes == FIRST {
-                    had.iter_mut().flatten().for_each(|had| *had = FIRST);
+                    needs.learn(&film, |_, _| even_rays);
+                    weight = FIRST_WEIGHT * f64::from(FIRST);
                 }
-                round = Some((Film::new(size.0, size.1), shares(&film, count), passes, count));
+                let count = passes.min(limits.passes - passes);
+                let due = needs.share(&tiles, count, stage.shadow_rays);
+                round = Some(Round { film: new_film(), due, first: passes, passes: count });
             }
             let (target, plan) = match &mut round {
-                Some((film, shares, first, count)) => (film, Some((&*shares, passes - *first, *count))),
+                Some(Round { film, due, first, passes: count }) => {
+                    (film, Some((&*due, passes - *first, *count)))
+                }
                 None => (&mut film, None),
             };
             let had_before = &had;
@@ -155,18 +144,20 @@ fn run(
                 // Each thread has its own, so nobody waits; a poisoned one holds no more than scratch.
                 let own = &scratches[rayon::current_thread_index().unwrap_or(0)];
                 let mut scratch = own.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
-                let Some((shares, pass, count)) = plan else {
-                    render_tile(stage, method, size.0, passes, tile, &mut scratch);
+                let Some((due, pass, count)) = plan else {
+                    let pixels = 0..tile.tile().len() as u32;
+                    let samples = pixels.map(|pixel| CameraSample { pixel, index: passes, rays: even_rays });
+                    render_samples(stage, method, size.0, samples, tile, &mut scratch);
                     return;
                 };
                 // Every pixel has its first sample in the first pass of the round.
-                let until = |share: u32, pass: u32| {
-                    (u64::from(share) * u64::from(pass)).div_ceil(u64::from(count)) as u32
+                let until = |samples: u32, pass: u32| {
+                    (u64::from(samples) * u64::from(pass)).div_ceil(u64::from(count)) as u32
                 };
-                let samples = (0u32..).zip(&shares[index]).flat_map(|(pixel, &share)| {
+                let samples = (0u32..).zip(&due[index]).flat_map(|(pixel, &Due { samples, rays })| {
                     let before = had_before[index][pixel as usize];
-                    let range = before + until(share, pass)..before + until(share, pass + 1);
-                    range.map(move |index| CameraSample { pixel, index })
+                    let range = before + until(samples, pass)..before + until(samples, pass + 1);
+                    range.map(move |index| CameraSample { pixel, index, rays })
                 });
                 render_samples(stage, method, size.0, samples, tile, &mut scratch);
             });
@@ -174,19 +165,23 @@ fn run(
                 break;
             }
             passes += 1;
-            if let Some((of_round, shares, first, count)) = round.take_if(|round| passes == round.2 + round.3)
-            {
-                film.merge(f64::from(first), &of_round, f64::from(count));
-                for (had, share) in had.iter_mut().flatten().zip(shares.iter().flatten()) {
-                    *had += share;
+            if let Some(done) = round.take_if(|round| passes == round.first + round.passes) {
+                film.merge(weight, &done.film, f64::from(done.passes));
+                weight += f64::from(done.passes);
+                needs.learn(&done.film, |tile, pixel| done.due[tile][pixel].rays);
+                for (had, due) in had.iter_mut().flatten().zip(done.due.iter().flatten()) {
+                    *had += due.samples;
                 }
             }
             method.passed(stage);
             passed(passes);
         }
         // Of a round that was broken off, whole passes count, and so do tiles of one more.
-        if let Some((of_round, _, first, _)) = round {
-            film.merge(f64::from(first), &of_round, f64::from((passes - first).max(1)));
+        if let Some(broken) = round {
+            let its = f64::from((passes - broken.first).max(1));
+            // One that has hardly begun is no better than the first passes.
+            let weight = if broken.first == FIRST { its.max(1.0) } else { weight };
+            film.merge(weight, &broken.film, its);
         }
     });
     let elapsed = start.elapsed();

@@ -52,8 +52,8 @@ pub struct RenderArgs {
     #[arg(long, value_enum, value_name = "SWITCH")]
     volumetric: Option<Switch>,
 
-    /// Whether camera samples go where the picture is not sure yet: --spp is then an average [default: on for --method
-    /// auto].
+    /// Whether camera samples go where the picture is not sure yet, and get fewer shadow rays where these are not what it
+    /// lacks: --spp then stands for the work of so many, from 8 on [default: on for --method auto].
     #[arg(long, value_enum)]
     adaptive: Option<Switch>,
 

@@ -386,7 +386,9 @@ impl Map {
             return needs;
         };
         scratch.draw_anew(PILOT_KEY);
-        sample_lights(&Stage { shadow_rays: rays, count: false, ..*stage }, scratch);
+        scratch.questions.points.iter_mut().for_each(|point| point.rays = rays);
+        sample_lights(stage, scratch);
+        scratch.questions.points.iter_mut().for_each(|point| point.rays = stage.shadow_rays);
         let Scratch { questions, estimates, shares, .. } = scratch;
         exact::trace(&Stage { count: false, ..*stage }, &[], questions, estimates, &mut Counts::default());
         let lights = self.remembered;
@@ -410,7 +412,7 @@ impl Map {
                 told.add(share.expected, near.map_or(1.0, |near| near.doubt(share.expected)));
             }
             let bright = brightness(stage, point.diffuse, shares, self.brightest);
-            needs.add(stage.shadow_rays, &told, bright);
+            needs.add(point.rays, &told, bright);
         }
         needs
     }
@@ -718,7 +720,8 @@ impl Auto {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
         let view = map.view();
         scratch.paths.clear();
-        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: 0 }));
+        let rays = stage.shadow_rays;
+        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: 0, rays }));
         cast(&Stage { count: false, ..*stage }, tile, width, scratch);
         let mut seen = vec![[f32::NAN; 3]; tile.len()];
         for point in &scratch.questions.points {
@@ -820,7 +823,8 @@ impl Visibility for Auto {
                     let (x, y) = tile.position(pixel as usize);
                     x % 2 == 0 && y % 2 == 0
                 });
-                scratch.paths.extend(some.map(|pixel| CameraSample { pixel, index: 0 }));
+                let rays = stage.shadow_rays;
+                scratch.paths.extend(some.map(|pixel| CameraSample { pixel, index: 0, rays }));
                 cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
@@ -947,7 +951,7 @@ impl Visibility for Auto {
                 }
             }
             let bright = brightness(stage, point.diffuse, shares, map.brightest);
-            needs.add(stage.shadow_rays, &told, bright);
+            needs.add(point.rays, &told, bright);
             if let Some(scale) = map.scale {
                 told.changed = true;
                 for (share, usual) in shares.iter_mut().zip(&*usual) {
@@ -968,7 +972,7 @@ impl Visibility for Auto {
                     told.changed = true;
                 }
             }
-            round(stage, sampler, shares, !told.changed);
+            round(sampler, shares, (!told.changed).then_some(point.rays));
             for ((share, &(thought, cell)), near) in shares.iter().zip(&known).zip(&nearby) {
                 let area = &stage.lights[share.light as usize];
                 let full = point.diffuse * area.radiance;

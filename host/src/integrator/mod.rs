@@ -14,7 +14,7 @@ pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
 pub use stochastic::{Form, Rule, Settings, Split, Stochastic};
 
 use crate::clock;
-use crate::film::{Tile, TileFilm};
+use crate::film::{Heard, Tile, TileFilm};
 use crate::light::AreaLight;
 use crate::sampler::{Pattern, Sampler};
 use crate::scene::{Frame, Scene};
@@ -121,6 +121,8 @@ pub struct ShadingPoint {
     pub diffuse: Vec3,
     /// The key of random numbers that are this point's own, for [`Sampler::from_key`].
     pub key: u64,
+    /// Shadow rays it is due, over all lights together.
+    pub rays: u32,
 }
 
 /// The samples of one light as seen from one point.
@@ -204,6 +206,8 @@ pub struct CameraSample {
     pub pixel: u32,
     /// The sample; those of a pixel are spread the better the fewer are left out.
     pub index: u32,
+    /// Its shadow rays, over all lights together; [`Stage::shadow_rays`] as a rule.
+    pub rays: u32,
 }
 
 /// What a thread keeps from tile to tile, so that nothing is allocated in between.
@@ -244,7 +248,12 @@ pub fn render_tile(
     scratch: &mut Scratch,
 ) {
     scratch.paths.clear();
-    scratch.paths.extend((0..film.tile().len() as u32).map(|pixel| CameraSample { pixel, index: pass }));
+    let rays = stage.shadow_rays;
+    scratch.paths.extend((0..film.tile().len() as u32).map(|pixel| CameraSample {
+        pixel,
+        index: pass,
+        rays,
+    }));
     render_paths(stage, method, width, film, scratch);
 }
 
@@ -288,7 +297,8 @@ fn render_paths(
 /// What one pass over a tile asks: for benchmarks and tests of visibility alone.
 pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
     let mut scratch = Scratch::default();
-    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: pass }));
+    let rays = stage.shadow_rays;
+    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: pass, rays }));
     cast(stage, tile, width, &mut scratch);
     sample_lights(stage, &mut scratch);
     scratch.questions
@@ -323,7 +333,7 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) {
     for first in (0..scratch.paths.len()).step_by(RayPacket::WIDTH) {
         let count = RayPacket::WIDTH.min(scratch.paths.len() - first);
         for lane in 0..count {
-            let CameraSample { pixel, index } = scratch.paths[first + lane];
+            let CameraSample { pixel, index, .. } = scratch.paths[first + lane];
             let (x, y) = tile.position(pixel as usize);
             let pixel = u64::from(y) * u64::from(width) + u64::from(x);
             let at = Sampler::in_pixel(stage.seed, pixel, index);
@@ -363,6 +373,7 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) {
                 triangle: hit.triangle,
                 diffuse: material.diffuse,
                 key: scratch.samplers[first + lane].key(),
+                rays: scratch.paths[first + lane].rays,
             });
         }
     }
@@ -380,7 +391,7 @@ const FAIR_SHARE: f32 = 0.1;
 /// averaged (weight 1/n), which is right for either number; else they are weighed by 1/e.
 fn divide(stage: &Stage<'_>, point: &ShadingPoint, sampler: &mut Sampler, shares: &mut Vec<Share>) {
     expect(stage, point, shares);
-    round(stage, sampler, shares, true);
+    round(sampler, shares, Some(point.rays));
 }
 
 /// How many samples each light that a point may see is due.
@@ -394,19 +405,22 @@ fn expect(stage: &Stage<'_>, point: &ShadingPoint, shares: &mut Vec<Share>) {
     let total: f32 = shares.iter().map(value).sum();
     let fair = FAIR_SHARE / shares.len() as f32;
     for share in shares.iter_mut() {
-        share.expected = stage.shadow_rays as f32 * ((1.0 - FAIR_SHARE) * value(share) / total + fair);
+        share.expected = point.rays as f32 * ((1.0 - FAIR_SHARE) * value(share) / total + fair);
     }
 }
 
-/// How many each gets; `all` if the rays are given in the end, whatever rounding does.
-fn round(stage: &Stage<'_>, sampler: &mut Sampler, shares: &mut [Share], all: bool) {
+/// How many each gets; `all` rays are given in the end, whatever rounding does, if it says how many that is.
+fn round(sampler: &mut Sampler, shares: &mut [Share], all: Option<u32>) {
     let mut due = f64::from(sampler.uniform());
     let mut given = 0u32;
     let last = shares.len().saturating_sub(1);
     for (place, share) in shares.iter_mut().enumerate() {
         due += f64::from(share.expected);
-        let until = if all && place == last { stage.shadow_rays } else { due as u32 };
-        let until = if all { until.clamp(given, stage.shadow_rays) } else { until };
+        let until = match all {
+            Some(all) if place == last => all,
+            Some(all) => (due as u32).clamp(given, all),
+            None => due as u32,
+        };
         share.count = until - given;
         given = until;
         let each = if share.expected > 1.001 { 1.0 / share.count as f32 } else { 1.0 / share.expected };
@@ -557,13 +571,32 @@ fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
 
 fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
     let Scratch { questions, estimates, radiance, paths, .. } = scratch;
-    for batch in &questions.batches {
+    let listens = film.listens();
+    for (index, batch) in questions.batches.iter().enumerate() {
         let samples = batch.samples.start as usize..batch.samples.end as usize;
-        let arrives: f32 =
-            questions.weights[samples.clone()].iter().zip(&estimates[samples]).map(|(w, v)| w * v).sum();
         let point = &questions.points[batch.point as usize];
-        radiance[point.path as usize] +=
-            point.diffuse * stage.lights[batch.light as usize].radiance * arrives;
+        let full = point.diffuse * stage.lights[batch.light as usize].radiance;
+        let (weights, estimates) = (&questions.weights[samples.clone()], &estimates[samples]);
+        if !listens {
+            let arrives: f32 = weights.iter().zip(estimates).map(|(w, v)| w * v).sum();
+            radiance[point.path as usize] += full * arrives;
+            continue;
+        }
+        let [mut all, mut arrives, mut visible, mut squares] = [0.0f32; 4];
+        for (w, v) in weights.iter().zip(estimates) {
+            all += w;
+            arrives += w * v;
+            visible += w * v * v;
+            squares += (w * v) * (w * v);
+        }
+        radiance[point.path as usize] += full * arrives;
+        // Where the form of the light has been taken out, only what is in the way differs from sample to sample.
+        let n = weights.len() as f32;
+        let formless = questions.wholes.get(index).is_some_and(|whole| !whole.is_nan());
+        let second = if formless { visible * all } else { squares * n };
+        let variance = (second - arrives * arrives) / (n - 1.0).max(1.0);
+        let heard = Heard::batch(weights.len(), point.rays, full.length_squared(), arrives, variance);
+        film.hear(point.pixel as usize, heard);
     }
     for (path, &radiance) in paths.iter().zip(radiance.iter()) {
         film.add(path.pixel as usize, radiance);

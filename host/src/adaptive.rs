@@ -1,0 +1,312 @@
+//! Which pixels get camera samples, and how many shadow rays these get, from what was seen in earlier rounds.
+//!
+//! The variance of a sample of a pixel has two parts. Shadow rays make one, and more rays a sample make it less; the other
+//! is of the place in the pixel, of edges and of what lies behind them, and only more samples make that less. A film that
+//! [listens](Film::listening) tells them apart. With `e` of edges and `s` at one ray, samples of `r` rays leave
+//!
+//! ```text
+//!     v(r) = e + s r^-1.5        at the cost        c(r) = 10 + r
+//! ```
+//!
+//! in shadow rays (the power is that of points spread well over a border; 10 is what a sample costs beside its rays, where
+//! one of them costs what most do). So each pixel has the number of rays with the least `v c`, and samples in proportion
+//! to `sqrt(v / c)`. That is how a given work makes the least squared error (Neyman 1934, and with costs Cochran, Sampling
+//! Techniques, 1977, section 5.5).
+//!
+//! As samples are spread over a pixel, too, its edges matter the less the more there are: `e` counts as `e / sqrt(n)`.
+
+use crate::film::{Film, Heard, Tile};
+use glam::DVec3;
+use rayon::prelude::*;
+
+/// The samples of a pixel in a round.
+#[derive(Clone, Copy, Debug, Default, PartialEq, Eq)]
+pub(crate) struct Due {
+    /// How many.
+    pub(crate) samples: u32,
+    /// The shadow rays of each.
+    pub(crate) rays: u32,
+}
+
+/// Passes over everything before anything is known.
+pub(crate) const FIRST: u32 = 4;
+
+/// With fewer passes than this there is nothing to be gained.
+pub(crate) const FEWEST: u32 = 2 * FIRST;
+
+/// What each of the first passes counts: where samples are needed most, theirs are few.
+pub(crate) const FIRST_WEIGHT: f64 = 0.05;
+
+/// What a camera sample costs beside its shadow rays, in shadow rays. Of twelve scenes at 16 rays, 6 to 24 do as well.
+const CAMERA: f32 = 10.0;
+
+/// Times the passes of a round that a pixel can have as samples at most.
+const MOST: f32 = 64.0;
+
+/// A pixel counts as if this part of the mean deviation were its own, so that what no sample has found yet is found.
+const FLOOR: f32 = 0.2;
+
+/// As many samples of a pixel say as much about it as those around it do.
+const TRUST: f32 = 8.0;
+
+/// Turns until samples and rays fit each other, and until rounded numbers cost what they may.
+const TURNS: u32 = 4;
+
+/// Shadow rays of a sample in the first passes: enough to tell what rays add.
+pub(crate) fn first_rays(usual: u32) -> u32 {
+    (usual / 4).max(usual.min(4))
+}
+
+/// Sums over the samples of a pixel.
+#[derive(Clone, Copy, Debug, Default)]
+struct Seen {
+    samples: f32,
+    /// Their mean, and summed squared distances from it.
+    mean: DVec3,
+    deviation: f64,
+    /// The power -1.5 of their rays.
+    power: f32,
+    /// The rays that they were due.
+    due: f32,
+    heard: Heard,
+}
+
+impl Seen {
+    fn add(&mut self, count: u32, rays: u32, (mean, deviation): (DVec3, f64), heard: &Heard) {
+        let (n, rays) = (count as f32, rays as f32);
+        let (before, added) = (f64::from(self.samples), f64::from(n));
+        let off = mean - self.mean;
+        self.deviation += deviation + off.length_squared() * (before * added / (before + added));
+        self.mean += off * (added / (before + added));
+        self.samples += n;
+        self.power += n / (rays * rays.sqrt());
+        self.due += n * rays;
+        self.heard += *heard;
+    }
+
+    fn model(&self) -> Model {
+        let (n, heard) = (self.samples, &self.heard);
+        if n < 2.0 {
+            return Model::default();
+        }
+        let variance = self.deviation as f32 / (n - 1.0);
+        let power = self.power / n;
+        // What single rays add cannot be told from edges, and counts as theirs.
+        let (known, unknown) =
+            if heard.all > 0.0 { (heard.noise / n, 1.0 - heard.known / heard.all) } else { (0.0, 0.0) };
+        let noise = known + unknown.clamp(0.0, 1.0) * (variance / power - known).max(0.0);
+        Model {
+            edge: (variance - noise * power).max(0.0),
+            noise,
+            all: heard.all / n,
+            each: heard.each / n,
+            asked: heard.rays / self.due,
+        }
+    }
+}
+
+/// The variance of a sample, and what it costs, by its rays.
+#[derive(Clone, Copy, Debug, Default)]
+struct Model {
+    edge: f32,
+    /// At one ray.
+    noise: f32,
+    /// Squared light, and the same over the rays of its light at one ray a sample: of lights that are left out at random.
+    all: f32,
+    each: f32,
+    /// Rays that are asked for each that is due.
+    asked: f32,
+}
+
+impl Model {
+    fn shadow(&self, rays: f32) -> f32 {
+        self.noise / (rays * rays.sqrt()) + (self.each / rays - self.all).max(0.0)
+    }
+
+    fn cost(&self, rays: f32) -> f32 {
+        CAMERA + self.asked * rays
+    }
+
+    /// The best number of rays of these, and in proportion to what there should be of such samples if there are about `n`.
+    fn choose(&self, choices: &[f32], n: f32) -> (f32, f32) {
+        let edge = self.edge / n.sqrt();
+        let product = |rays: f32| (edge + self.shadow(rays)) * self.cost(rays);
+        let better = |a: f32, b: f32| if product(b) < product(a) { b } else { a };
+        let rays = choices.iter().copied().reduce(better).unwrap_or(1.0);
+        // The derivative of e n^-1.5 + s n^-1.
+        (((1.5 * edge + self.shadow(rays)) / self.cost(rays)).sqrt(), rays)
+    }
+}
+
+/// What is known of each pixel of an image.
+#[derive(Debug)]
+pub(crate) struct Needs {
+    width: usize,
+    height: usize,
+    seen: Vec<Seen>,
+}
+
+impl Needs {
+    /// Nothing yet.
+    pub(crate) fn new(width: u32, height: u32) -> Self {
+        let (width, height) = (width as usize, height as usize);
+        Self { width, height, seen: vec![Seen::default(); width * height] }
+    }
+
+    /// Takes in a round; `rays` says how many the samples of each pixel of each tile had.
+    ///
+    /// # Panics
+    /// If the film is larger or does not listen.
+    pub(crate) fn learn(&mut self, film: &Film, rays: impl Fn(usize, usize) -> u32) {
+        for (index, tile) in film.tiles().iter().enumerate() {
+            for pixel in (0..tile.tile().len()).filter(|&pixel| tile.count(pixel) > 0) {
+                let (x, y) = tile.tile().position(pixel);
+                let seen = &mut self.seen[y as usize * self.width + x as usize];
+                seen.add(tile.count(pixel), rays(index, pixel), tile.spread(pixel), tile.heard(pixel));
+            }
+        }
+    }
+
+    /// Of all pixels, each with a part of what those around it know.
+    fn models(&self) -> Vec<Model> {
+        let (width, height) = (self.width, self.height);
+        let own: Vec<Model> = self.seen.par_iter().map(Seen::model).collect();
+        let mut models: Vec<Model> = (0..own.len())
+            .into_par_iter()
+            .with_min_len(width.max(1))
+            .map(|at| {
+                let (x, y) = (at % width, at / width);
+                let (rows, columns) =
+                    (y.saturating_sub(1)..(y + 2).min(height), x.saturating_sub(1)..(x + 2).min(width));
+                let each = 1.0 / (rows.len() * columns.len()) as f32;
+                let (mut edge, mut noise) = (0.0, 0.0);
+                for near in rows.flat_map(|y| &own[y * width..][columns.clone()]) {
+                    edge += each * near.edge;
+                    noise += each * near.noise;
+                }
+                let trust = self.seen[at].samples / (self.seen[at].samples + TRUST);
+                let mix = |own: f32, around: f32| trust * own + (1.0 - trust) * around;
+                Model { edge: mix(own[at].edge, edge), noise: mix(own[at].noise, noise), ..own[at] }
+            })
+            .collect();
+        let mean = |of: fn(&Model) -> f32| {
+            let sum: f64 = models.iter().map(|model| f64::from(of(model).sqrt())).sum();
+            (sum / models.len().max(1) as f64) as f32
+        };
+        let least = [mean(|model| model.edge), mean(|model| model.noise)].map(|mean| (FLOOR * mean).powi(2));
+        for model in &mut models {
+            model.edge += least[0];
+            model.noise += least[1];
+        }
+        models
+    }
+
+    /// What the pixels of the tiles are due in a round that costs as much as so many passes of the usual rays; each has one
+    /// sample at least.
+    pub(crate) fn share(&self, tiles: &[Tile], passes: u32, usual: u32) -> Vec<Vec<Due>> {
+        let models = self.models();
+        let halves = std::iter::successors(Some(usual.max(1)), |&rays| (rays > 1).then_some(rays / 2));
+        let choices: Vec<f32> = halves.map(|rays| rays as f32).collect();
+        let most = MOST * passes as f32;
+        // Sums in the order of pixels, whatever the threads.
+        let sum = |costs: Vec<f32>| costs.into_iter().map(f64::from).sum::<f64>();
+        let budget = sum(models.iter().map(|model| model.cost(usual as f32)).collect()) * f64::from(passes);
+        let scaled = |cost: f64| if cost > 0.0 { (budget / cost) as f32 } else { 1.0 };
+        let mut due = vec![(passes as f32, usual as f32); models.len()];
+        let mut scale = 1.0f32;
+        for _ in 0..TURNS {
+            let costs = due.par_iter_mut().zip(&models).with_min_len(1024).map(|(due, model)| {
+                *due = model.choose(&choices, (due.0 * scale).clamp(1.0, most));
+                due.0 * model.cost(due.1)
+            });
+            scale = scaled(sum(costs.collect()));
+        }
+        let rounded = |samples: f32, scale: f32| (samples * scale).round().clamp(1.0, most);
+        for _ in 0..TURNS {
+            let costs = due.iter().zip(&models).map(|(due, model)| rounded(due.0, scale) * model.cost(due.1));
+            scale *= scaled(sum(costs.collect()));
+        }
+        let of = |(x, y): (u32, u32)| {
+            let (samples, rays) = due[y as usize * self.width + x as usize];
+            Due { samples: rounded(samples, scale) as u32, rays: rays as u32 }
+        };
+        tiles.iter().map(|tile| (0..tile.len()).map(|pixel| of(tile.position(pixel))).collect()).collect()
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    /// A pixel whose samples have so much variance of edges and, at one ray, of rays; ten samples of four rays.
+    fn seen(edge: f32, noise: f32) -> Seen {
+        let variance = f64::from(edge + noise / 8.0);
+        let heard = Heard { rays: 40.0, all: 10.0, known: 10.0, noise: 10.0 * noise, each: 2.5 };
+        let mut seen = Seen::default();
+        seen.add(10, 4, (DVec3::ONE, 9.0 * variance), &heard);
+        seen
+    }
+
+    fn needs(pixels: &[Seen]) -> Needs {
+        Needs { width: pixels.len(), height: 1, seen: pixels.to_vec() }
+    }
+
+    #[test]
+    fn edges_and_rays_are_told_apart() {
+        let model = seen(2.0, 16.0).model();
+        assert!((model.edge - 2.0).abs() < 1e-5 && (model.noise - 16.0).abs() < 1e-5, "{model:?}");
+        assert_eq!(model.asked, 1.0);
+        // Of batches of one ray nothing is known: all of the variance may be theirs.
+        let mut single = seen(2.0, 16.0);
+        (single.heard.known, single.heard.noise) = (0.0, 0.0);
+        let model = single.model();
+        assert!(model.edge < 1e-4 && (model.noise - 32.0).abs() < 1e-4, "{model:?}");
+    }
+
+    #[test]
+    fn rounds_are_added_up_like_one() {
+        let values = [1.0, 4.0, 2.0, 8.0, 5.0, 7.0];
+        let of = |values: &[f64]| {
+            let mean = values.iter().sum::<f64>() / values.len() as f64;
+            (DVec3::splat(mean), values.iter().map(|value| 3.0 * (value - mean).powi(2)).sum::<f64>())
+        };
+        let mut seen = Seen::default();
+        for part in [&values[..1], &values[1..4], &values[4..]] {
+            seen.add(part.len() as u32, 4, of(part), &Heard::default());
+        }
+        let (mean, deviation) = of(&values);
+        assert!((seen.mean - mean).length() < 1e-12 && (seen.deviation - deviation).abs() < 1e-9, "{seen:?}");
+        assert_eq!((seen.samples, seen.due), (6.0, 24.0));
+    }
+
+    #[test]
+    fn a_round_costs_what_it_may_and_goes_where_it_helps() {
+        let mut pixels = vec![seen(0.0, 0.0); 64];
+        (pixels[8], pixels[40]) = (seen(10.0, 0.01), seen(0.01, 10.0));
+        let tiles = [Tile { x: 0, y: 0, width: 32, height: 1 }, Tile { x: 32, y: 0, width: 32, height: 1 }];
+        for (passes, usual) in [(8, 16), (4, 64), (100, 1)] {
+            let shares = needs(&pixels).share(&tiles, passes, usual);
+            assert!(shares.iter().flatten().all(|due| due.samples >= 1 && (1..=usual).contains(&due.rays)));
+            let cost: f32 =
+                shares.iter().flatten().map(|due| due.samples as f32 * (CAMERA + due.rays as f32)).sum();
+            let may = 64.0 * passes as f32 * (CAMERA + usual as f32);
+            assert!((0.8..1.1).contains(&(cost / may)), "{passes} passes of {usual}: {cost} of {may}");
+            let (edge, noisy, calm) = (shares[0][8], shares[1][8], shares[0][20]);
+            assert!(
+                edge.samples > 4 * calm.samples.max(2) && noisy.samples > calm.samples,
+                "{edge:?} {noisy:?} {calm:?}"
+            );
+            assert!(edge.rays <= noisy.rays && noisy.rays == usual && (usual == 1 || edge.rays < usual));
+        }
+    }
+
+    #[test]
+    fn where_all_is_alike_all_get_the_same_and_black_is_no_trouble() {
+        for pixel in [seen(0.0, 0.0), seen(1.0, 1.0), Seen::default()] {
+            let tiles = [Tile { x: 0, y: 0, width: 5, height: 1 }];
+            let shares = needs(&[pixel; 5]).share(&tiles, 4, 16);
+            assert!(shares[0].iter().all(|due| *due == shares[0][2]), "{shares:?}");
+        }
+        assert!(Needs::new(0, 0).share(&[], 4, 16).is_empty());
+    }
+}
