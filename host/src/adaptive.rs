@@ -46,6 +46,9 @@ const MOST: f32 = 64.0;
 /// A pixel counts as if this part of the mean deviation were its own, so that what no sample has found yet is found.
 const FLOOR: f32 = 0.2;
 
+/// The same of what rays add: there is less to be found, and more rays where nothing is are dear.
+const NOISE_FLOOR: f32 = 0.05;
+
 /// As many samples of a pixel say as much about it as those around it do.
 const TRUST: f32 = 8.0;
 
@@ -193,10 +196,10 @@ impl Needs {
             let sum: f64 = models.iter().map(|model| f64::from(of(model).sqrt())).sum();
             (sum / models.len().max(1) as f64) as f32
         };
-        let least = [mean(|model| model.edge), mean(|model| model.noise)].map(|mean| (FLOOR * mean).powi(2));
+        let (edge, noise) = (mean(|model| model.edge), mean(|model| model.noise));
         for model in &mut models {
-            model.edge += least[0];
-            model.noise += least[1];
+            model.edge += (FLOOR * edge).powi(2);
+            model.noise += (NOISE_FLOOR * noise).powi(2);
         }
         models
     }

@@ -141,13 +141,14 @@ impl Heard {
     /// A batch of so many rays, of a sample that was due `due`. Of radiance 1 it saw `seen`, with a variance over `rays`
     /// *independent* rays of `variance`; `full` is radiance times reflectance, squared.
     #[inline]
-    pub fn batch(rays: usize, due: u32, full: f32, seen: f32, variance: f32) -> Self {
+    pub fn batch(rays: usize, due: u32, share: f32, full: f32, seen: f32, variance: f32) -> Self {
         let (n, due) = (rays as f32, due as f32);
-        let all = full * seen * seen;
+        let square = full * seen * seen;
+        let all = square / share;
         // Spread rays make less, by the root of their number.
         let (known, noise) =
             if rays > 1 { (all, full * variance.max(0.0) * due * (due / n).sqrt()) } else { (0.0, 0.0) };
-        Self { rays: n, all, known, noise, each: all * due / n }
+        Self { rays: n, all, known, noise, each: square * due / n }
     }
 }
 

@@ -111,7 +111,7 @@ fn run(
     let start = Instant::now();
     let mut passes = 0;
     let out_of_time = || limits.time.is_some_and(|most| start.elapsed() >= most);
-    let even_rays = if adaptive { first_rays(stage.shadow_rays) } else { stage.shadow_rays };
+    let even_rays = adaptive.then(|| first_rays(stage.shadow_rays));
     pool.install(|| {
         let tiles: Vec<_> = film.tiles().iter().map(TileFilm::tile).collect();
         method.begin(stage, &tiles, size.0);
@@ -123,7 +123,7 @@ fn run(
         while passes < limits.passes && !stop.load(Ordering::Relaxed) && !(passes > 0 && out_of_time()) {
             if adaptive && passes >= FIRST && round.is_none() {
                 if passes == FIRST {
-                    needs.learn(&film, |_, _| even_rays);
+                    needs.learn(&film, |_, _| even_rays.unwrap_or(stage.shadow_rays));
                     weight = FIRST_WEIGHT * f64::from(FIRST);
                 }
                 let count = passes.min(limits.passes - passes);
@@ -157,7 +157,7 @@ fn run(
                 let samples = (0u32..).zip(&due[index]).flat_map(|(pixel, &Due { samples, rays })| {
                     let before = had_before[index][pixel as usize];
                     let range = before + until(samples, pass)..before + until(samples, pass + 1);
-                    range.map(move |index| CameraSample { pixel, index, rays })
+                    range.map(move |index| CameraSample { pixel, index, rays: Some(rays) })
                 });
                 render_samples(stage, method, size.0, samples, tile, &mut scratch);
             });

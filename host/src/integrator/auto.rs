@@ -269,6 +269,10 @@ const PILOT_KEY: u64 = 0x510e_527f_ade6_82d1;
 /// what it would be.
 const MOST_MORE: f32 = 8.0;
 
+/// Of rays that are its own a point gets this part at least, however little its lights are in doubt: where they are few, what
+/// is left of them would count too much.
+const LEAST_OWN: f32 = 0.5;
+
 /// Nor more than this, unless that is usual: what a tile asks is in memory at once.
 const MOST_RAYS: f32 = 2048.0;
 
@@ -720,8 +724,11 @@ impl Auto {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
         let view = map.view();
         scratch.paths.clear();
-        let rays = stage.shadow_rays;
-        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: 0, rays }));
+        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample {
+            pixel,
+            index: 0,
+            rays: None,
+        }));
         cast(&Stage { count: false, ..*stage }, tile, width, scratch);
         let mut seen = vec![[f32::NAN; 3]; tile.len()];
         for point in &scratch.questions.points {
@@ -823,8 +830,7 @@ impl Visibility for Auto {
                     let (x, y) = tile.position(pixel as usize);
                     x % 2 == 0 && y % 2 == 0
                 });
-                let rays = stage.shadow_rays;
-                scratch.paths.extend(some.map(|pixel| CameraSample { pixel, index: 0, rays }));
+                scratch.paths.extend(some.map(|pixel| CameraSample { pixel, index: 0, rays: None }));
                 cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
@@ -952,10 +958,16 @@ impl Visibility for Auto {
             }
             let bright = brightness(stage, point.diffuse, shares, map.brightest);
             needs.add(point.rays, &told, bright);
-            if let Some(scale) = map.scale {
+            let mut scale = map.scale.map(|scale| scale * bright);
+            if point.firm && told.sum > 0.0 {
+                let unproven = known.iter().zip(&usual).filter(|((thought, _), _)| *thought != Known::Lit);
+                let own = unproven.map(|(_, usual)| usual).sum::<f32>() / told.sum;
+                scale = Some(scale.unwrap_or(own).max(own * LEAST_OWN));
+            }
+            if let Some(scale) = scale {
                 told.changed = true;
                 for (share, usual) in shares.iter_mut().zip(&*usual) {
-                    let due = share.expected * (scale * bright);
+                    let due = share.expected * scale;
                     share.expected = if share.expected > 0.0 {
                         due.clamp(usual * (1.0 / MOST_MORE), (usual * MOST_MORE).min(usual.max(MOST_RAYS)))
                     } else {

@@ -123,6 +123,8 @@ pub struct ShadingPoint {
     pub key: u64,
     /// Shadow rays it is due, over all lights together.
     pub rays: u32,
+    /// Whether they are its own, and not to be shared with other points.
+    pub firm: bool,
 }
 
 /// The samples of one light as seen from one point.
@@ -206,8 +208,8 @@ pub struct CameraSample {
     pub pixel: u32,
     /// The sample; those of a pixel are spread the better the fewer are left out.
     pub index: u32,
-    /// Its shadow rays, over all lights together; [`Stage::shadow_rays`] as a rule.
-    pub rays: u32,
+    /// Its shadow rays, over all lights together. Of `None` the usual number, which a method may share with other samples.
+    pub rays: Option<u32>,
 }
 
 /// What a thread keeps from tile to tile, so that nothing is allocated in between.
@@ -248,11 +250,10 @@ pub fn render_tile(
     scratch: &mut Scratch,
 ) {
     scratch.paths.clear();
-    let rays = stage.shadow_rays;
     scratch.paths.extend((0..film.tile().len() as u32).map(|pixel| CameraSample {
         pixel,
         index: pass,
-        rays,
+        rays: None,
     }));
     render_paths(stage, method, width, film, scratch);
 }
@@ -297,8 +298,7 @@ fn render_paths(
 /// What one pass over a tile asks: for benchmarks and tests of visibility alone.
 pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
     let mut scratch = Scratch::default();
-    let rays = stage.shadow_rays;
-    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: pass, rays }));
+    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: pass, rays: None }));
     cast(stage, tile, width, &mut scratch);
     sample_lights(stage, &mut scratch);
     scratch.questions
@@ -373,7 +373,8 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) {
                 triangle: hit.triangle,
                 diffuse: material.diffuse,
                 key: scratch.samplers[first + lane].key(),
-                rays: scratch.paths[first + lane].rays,
+                rays: scratch.paths[first + lane].rays.unwrap_or(stage.shadow_rays),
+                firm: scratch.paths[first + lane].rays.is_some(),
             });
         }
     }
@@ -595,7 +596,8 @@ fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
         let formless = questions.wholes.get(index).is_some_and(|whole| !whole.is_nan());
         let second = if formless { visible * all } else { squares * n };
         let variance = (second - arrives * arrives) / (n - 1.0).max(1.0);
-        let heard = Heard::batch(weights.len(), point.rays, full.length_squared(), arrives, variance);
+        let heard =
+            Heard::batch(weights.len(), point.rays, batch.share, full.length_squared(), arrives, variance);
         film.hear(point.pixel as usize, heard);
     }
     for (path, &radiance) in paths.iter().zip(radiance.iter()) {

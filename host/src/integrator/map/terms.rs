@@ -350,7 +350,18 @@ fn start_at(stage: &Stage<'_>, prepared: &PreparedMap, light: &AreaLight, id: Ph
     let normal = photons::normal(stage.scene, triangle).unwrap_or(Vec3::ZERO);
     let normal = if normal.dot(path) < 0.0 { -normal } else { normal };
     let origin = offset(x, normal, stage.bvh.clearance());
-    ShadingPoint { pixel: 0, path: 0, x, origin, normal, triangle, diffuse: Vec3::ZERO, key: 0, rays: 0 }
+    ShadingPoint {
+        pixel: 0,
+        path: 0,
+        x,
+        origin,
+        normal,
+        triangle,
+        diffuse: Vec3::ZERO,
+        key: 0,
+        rays: 0,
+        firm: false,
+    }
 }
 
 /// The batch at hand: first its test rays, if probabilities are learned, and then its samples.
