@@ -310,6 +310,8 @@ struct Needs {
     /// What lights send unlike their mean makes of the variance, where they are seen, and what shadows make of it.
     form: u64,
     shadow: u64,
+    /// What was seen of the error.
+    gain: Gain,
 }
 
 /// Rays of a pixel before it is known what it needs.
@@ -318,9 +320,114 @@ const TELLING: u64 = 64;
 /// Needs are counted in these parts.
 const NEED: f32 = 4096.0;
 
+/// Variances of visibility as samples left them, and as the usual ones would have, weighed by squared light.
+///
+/// Well spread samples leave `v (1 - v) n^-1.5` where borders are long against their distance, and `n^-1` where fine things
+/// are in the way; which of both, a quarter of a light tells: it has half of the variance of the whole, or all of it.
+#[derive(Clone, Copy, Debug, Default)]
+struct Gain {
+    /// With the powers -1 and -1.5.
+    before: [u64; 2],
+    left: [u64; 2],
+    /// Variances of a sample within quarters of a light, and in all of it.
+    quarters: u64,
+    whole: u64,
+}
+
+/// Variances are counted in these parts.
+const FINE: f64 = 4_294_967_296.0;
+
+/// Samples of a light before its quarters tell anything.
+const QUARTERED: f32 = 8.0;
+
+/// Sums of a tile, for [`Gain`].
+#[derive(Clone, Copy, Debug, Default)]
+struct TileGain {
+    before: [f64; 2],
+    left: [f64; 2],
+    quarters: f64,
+    whole: f64,
+}
+
+impl TileGain {
+    /// Adds a batch of n samples, and `usual` otherwise, that saw `v` of squared light `light`; `forms` are what the form of
+    /// the light adds to the variance, and what is left of that.
+    #[inline(always)]
+    fn add(&mut self, light: f32, v: f32, [n, usual]: [f32; 2], forms: [f32; 2]) -> f32 {
+        let one = v * (1.0 - v) * (n / (n - 1.0));
+        for (k, [n, usual]) in [[n, usual], [n * n.sqrt(), usual * usual.sqrt()]].into_iter().enumerate() {
+            self.before[k] += f64::from(light * (one / usual + forms[0]));
+            self.left[k] += f64::from(light * (one / n + forms[1]));
+        }
+        light * one
+    }
+
+    /// Adds what its quarters saw, where all of it has the variance `whole`.
+    fn add_quarters(&mut self, light: f32, whole: f32, bins: &[u8], estimates: &[f32]) {
+        let (mut asked, mut free) = ([0.0f32; 4], [0.0f32; 4]);
+        for (&bin, &estimate) in bins.iter().zip(estimates) {
+            let quarter = usize::from(bin >> 4 & 2 | bin >> 2 & 1);
+            asked[quarter] += 1.0;
+            free[quarter] += if estimate > 0.0 { 1.0 } else { 0.0 };
+        }
+        let (mut sum, mut samples) = (0.0, 0.0);
+        for (n, free) in asked.into_iter().zip(free).filter(|(n, _)| *n > 1.0) {
+            sum += n * (free / n) * (1.0 - free / n) * (n / (n - 1.0));
+            samples += n;
+        }
+        if samples > 0.0 {
+            self.quarters += f64::from(light * (sum / samples));
+            self.whole += f64::from(whole);
+        }
+    }
+
+    fn counted(&self) -> Gain {
+        let count = |sum: f64| (sum * FINE) as u64;
+        Gain {
+            before: self.before.map(count),
+            left: self.left.map(count),
+            quarters: count(self.quarters),
+            whole: count(self.whole),
+        }
+    }
+}
+
+impl Gain {
+    fn merge(&mut self, other: &Self) {
+        for k in 0..2 {
+            self.before[k] += other.before[k];
+            self.left[k] += other.left[k];
+        }
+        self.quarters += other.quarters;
+        self.whole += other.whole;
+    }
+
+    /// How many times less variance there is than the usual samples would leave; none if that cannot be told.
+    fn value(&self) -> Option<f64> {
+        if self.left.contains(&0) {
+            return None;
+        }
+        let each = |k: usize| (self.before[k] as f64 / self.left[k] as f64).ln();
+        let spread = if self.quarters > 0 {
+            (self.whole as f64 / self.quarters as f64).log2().clamp(0.0, 1.0)
+        } else {
+            0.0
+        };
+        Some((each(0) + spread * (each(1) - each(0))).exp())
+    }
+}
+
 /// With less to gain than this, and with less of the variance due to the form of lights, the exact method does as well.
 const WORTH: f64 = 1.1;
 const FORM: f64 = 0.1;
+
+/// The variance has to fall by this where cells promise less than that: rays in doubt are dearer, and what was seen says a bit
+/// too much. (Soup sees 1.3, of which its passes need 1.2; forest and hair see 1.6.)
+const MUCH: f64 = 1.4;
+const SOME: f64 = 1.2;
+
+/// Passes before promises of cells are held against that.
+const PATIENCE_WITH_ODDS: u32 = 3;
 
 impl Needs {
     /// Adds a point that would get `usual` samples.
@@ -340,6 +447,7 @@ impl Needs {
         self.costs[1] += other.costs[1];
         self.form += other.form;
         self.shadow += other.shadow;
+        self.gain.merge(&other.gain);
     }
 
     /// What to multiply weights with, so that samples cost about as much as usual.
@@ -985,7 +1093,9 @@ impl Visibility for Auto {
                 }
             }
             round(sampler, shares, (!told.changed).then_some(point.rays));
-            for ((share, &(thought, cell)), near) in shares.iter().zip(&known).zip(&nearby) {
+            for (((share, &(thought, cell)), near), &usual) in
+                shares.iter().zip(&known).zip(&nearby).zip(&usual)
+            {
                 let area = &stage.lights[share.light as usize];
                 let full = point.diffuse * area.radiance;
                 let whole = if area.is_apart(point.x) { share.unshadowed * FRAC_1_PI } else { f32::NAN };
@@ -1043,6 +1153,7 @@ impl Visibility for Auto {
                         share: share.count as f32 * share.each,
                     });
                     questions.wholes.push(open);
+                    questions.usual.push(usual);
                 } else if open.is_finite()
                     && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                 {
@@ -1085,7 +1196,9 @@ impl Visibility for Auto {
         }
         let mut pasts = map.pasts_of(questions.place);
         let (mut form, mut shadow) = (0.0f64, 0.0f64);
-        for (batch, &whole) in questions.batches.iter().zip(&questions.wholes) {
+        let mut sums = TileGain::default();
+        for ((batch, &whole), &usual) in questions.batches.iter().zip(&questions.wholes).zip(&questions.usual)
+        {
             let pixel = questions.points[batch.point as usize].pixel;
             if whole.is_nan() {
                 continue;
@@ -1097,13 +1210,19 @@ impl Visibility for Auto {
             let [all, free] = past::sums(&questions.weights[samples], estimates);
             let off = if whole.is_finite() { whole - all } else { 0.0 };
             let v = (free / all).min(1.0);
-            past.mark(
-                v,
-                &questions.bins[batch.samples.start as usize..batch.samples.end as usize],
-                estimates,
-            );
+            let bins = &questions.bins[batch.samples.start as usize..batch.samples.end as usize];
+            past.mark(v, bins, estimates);
             form += f64::from((v * off / all).powi(2));
             shadow += f64::from(v * (1.0 - v) / (count * count.sqrt()));
+            if count > 1.0 {
+                let radiance = stage.lights[batch.light as usize].radiance * (all / map.brightest);
+                let light = (questions.points[batch.point as usize].diffuse * radiance).length_squared();
+                let form = |v: f32| (v * off / all).powi(2);
+                let whole = sums.add(light, v, [count, usual], [form(v), form(v - past.mean())]);
+                if whole > 0.0 && count >= QUARTERED && (batch.point + map.passes).is_multiple_of(4) {
+                    sums.add_quarters(light, whole, bins, estimates);
+                }
+            }
             let more = past.asked(v, off) / all;
             if more != 0.0 {
                 estimates.iter_mut().for_each(|estimate| *estimate += more);
@@ -1112,6 +1231,7 @@ impl Visibility for Auto {
         if let Some(pasts) = &mut pasts {
             pasts.needs.form += (form * f64::from(NEED)) as u64;
             pasts.needs.shadow += (shadow * f64::from(NEED)) as u64;
+            pasts.needs.gain.merge(&sums.counted());
         }
         if doubts != Doubts::default() {
             self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
@@ -1130,8 +1250,12 @@ impl Visibility for Auto {
         }
         map.scale = (map.remembered > 0).then(|| needs.scale());
         map.seen += u64::from(stage.shadow_rays);
-        if map.asleep {
-            map.plain = !self.restless && (map.remembered == 0 || map.seen >= TELLING && !needs.worth());
+        let helps = needs.gain.value().map_or_else(|| needs.worth(), |gain| gain > MUCH);
+        let all_doubt = map.passes >= PATIENCE_WITH_ODDS && map.promise < SOME;
+        if map.asleep || all_doubt {
+            map.plain = !self.restless && (map.remembered == 0 || map.seen >= TELLING && !helps);
+        }
+        if map.plain || map.asleep {
             return;
         }
         let strays =
@@ -1162,6 +1286,29 @@ fn worth_learning(passes: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn quarters_tell_fine_things_from_long_borders() {
+        let bins: Vec<u8> = (0..64).collect();
+        let gain = |free: fn(u8) -> bool| {
+            let estimates: Vec<f32> = bins.iter().map(|&bin| f32::from(u8::from(free(bin)))).collect();
+            let v = estimates.iter().sum::<f32>() / 64.0;
+            let mut sums = TileGain::default();
+            let whole = sums.add(1.0, v, [64.0, 16.0], [0.0; 2]);
+            sums.add_quarters(1.0, whole, &bins, &estimates);
+            (sums.counted().value().expect("both"), sums.quarters / sums.whole)
+        };
+        // A border down the middle of the left half, and a chessboard.
+        let (border, half) = gain(|bin| bin % 8 < 2);
+        assert!((half - 0.667).abs() < 0.03 && border > 6.0 && border < 8.0, "{border} {half}");
+        let (fine, all) = gain(|bin| (bin ^ bin >> 3) & 1 == 0);
+        assert!((all - 1.05).abs() < 0.03 && (fine - 4.0).abs() < 1e-3, "{fine} {all}");
+        // What the light's form adds counts with either power, and nothing seen is nothing told.
+        let mut sums = TileGain::default();
+        sums.add(2.0, 0.0, [8.0, 8.0], [0.5, 0.25]);
+        assert_eq!(sums.counted().value(), Some(2.0));
+        assert_eq!(Gain::default().value(), None);
+    }
 
     #[test]
     fn needs_scale_to_the_usual_cost_and_tell_whether_weights_help() {

@@ -160,6 +160,8 @@ pub struct Questions {
     /// And for each batch what would arrive with nothing in the way, of reflectance and radiance 1; infinite where
     /// that has been dealt with, and not a number where it is not known.
     wholes: Vec<f32>,
+    /// And for each batch how many samples it would have had without what was learned.
+    usual: Vec<f32>,
     /// The tile's first column and row.
     place: [u32; 2],
 }
@@ -176,6 +178,7 @@ impl Questions {
         self.cells.clear();
         self.bins.clear();
         self.wholes.clear();
+        self.usual.clear();
     }
 }
 
