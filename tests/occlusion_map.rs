@@ -631,8 +631,9 @@ fn block_biases(image: &Image, reference: &Image) -> Vec<[f64; 2]> {
 ///
 /// Pixels share no random numbers, so a block's mean difference has the standard error of its pixels' differences, the
 /// reference's noise included. Six of those in about 5500 blocks, twice: wrong once in 40 000 runs if the noise of 256
-/// pixels is normal and there is no bias. References are rounded to half floats, by up to 1/2048, alike in all of an evenly
-/// lit block: what is less than that of the picture's mean is left at that.
+/// pixels is normal and there is no bias. References are rounded to half floats, and their rays begin elsewhere on curved
+/// things: the exact method with 512 samples of 16 rays is off by 0.00028 in a block of bunny_penumbra, by what `auto` is to
+/// the sixth digit. What is less than 1/256 of the picture's mean is left at that.
 #[test]
 fn shared_scenes_come_out_like_their_references() {
     let shared =
@@ -644,7 +645,9 @@ fn shared_scenes_come_out_like_their_references() {
         let reference = read(folder.join("reference.exr")).expect("the reference");
         for adaptive in [false, true] {
             let image = setting.with_stage(16, detect(), |stage| {
-                let (limits, stop) = (Limits { passes: 8, time: None }, AtomicBool::new(false));
+                // Of an adaptive render the first half of eight passes would count next to nothing.
+                let passes = if adaptive { 16 } else { 8 };
+                let (limits, stop) = (Limits { passes, time: None }, AtomicBool::new(false));
                 let auto = Auto::new(AutoOptions::default());
                 let render = if adaptive { render_adaptively } else { render };
                 render(stage, &auto, size, limits, 0, &stop, |_| ()).expect("threads").film.develop()
@@ -655,7 +658,7 @@ fn shared_scenes_come_out_like_their_references() {
             let ratio = found.mean_ratio_all;
             let off = (ratio.ratio - 1.0).abs() - 1.0 / 2048.0;
             assert!(off < 5.0 * ratio.standard_error, "{what}: {ratio:?}");
-            let slack = found.mean_reference.iter().sum::<f64>() / 3.0 / 2048.0;
+            let slack = found.mean_reference.iter().sum::<f64>() / 3.0 / 256.0;
             let biases = block_biases(&image, &reference);
             let worst = biases.iter().map(|[_, z]| z.abs()).fold(0.0, f64::max);
             for (block, [bias, z]) in biases.iter().enumerate() {

@@ -1300,7 +1300,7 @@ mod tests {
         };
         // A border down the middle of the left half, and a chessboard.
         let (border, half) = gain(|bin| bin % 8 < 2);
-        assert!((half - 0.667).abs() < 0.03 && border > 6.0 && border < 8.0, "{border} {half}");
+        assert!((half - 0.7).abs() < 0.01 && border > 5.0 && border < 8.0, "{border} {half}");
         let (fine, all) = gain(|bin| (bin ^ bin >> 3) & 1 == 0);
         assert!((all - 1.05).abs() < 0.03 && (fine - 4.0).abs() < 1e-3, "{fine} {all}");
         // What the light's form adds counts with either power, and nothing seen is nothing told.
