@@ -312,6 +312,8 @@ struct Needs {
     shadow: u64,
     /// What was seen of the error.
     gain: Gain,
+    /// Whether rays were the points' own. Who shares them out counts on what is known of lights, and goes on having it.
+    firm: bool,
 }
 
 /// Rays of a pixel before it is known what it needs.
@@ -448,6 +450,7 @@ impl Needs {
         self.form += other.form;
         self.shadow += other.shadow;
         self.gain.merge(&other.gain);
+        self.firm |= other.firm;
     }
 
     /// What to multiply weights with, so that samples cost about as much as usual.
@@ -1066,6 +1069,7 @@ impl Visibility for Auto {
             }
             let bright = brightness(stage, point.diffuse, shares, map.brightest);
             needs.add(point.rays, &told, bright);
+            needs.firm |= point.firm;
             let mut scale = map.scale.map(|scale| scale * bright);
             if point.firm && told.sum > 0.0 {
                 let unproven = known.iter().zip(&usual).filter(|((thought, _), _)| *thought != Known::Lit);
@@ -1252,7 +1256,7 @@ impl Visibility for Auto {
         map.seen += u64::from(stage.shadow_rays);
         let helps = needs.gain.value().map_or_else(|| needs.worth(), |gain| gain > MUCH);
         let all_doubt = map.passes >= PATIENCE_WITH_ODDS && map.promise < SOME;
-        if map.asleep || all_doubt {
+        if !needs.firm && (map.asleep || all_doubt) {
             map.plain = !self.restless && (map.remembered == 0 || map.seen >= TELLING && !helps);
         }
         if map.plain || map.asleep {
