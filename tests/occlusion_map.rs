@@ -633,7 +633,8 @@ fn block_biases(image: &Image, reference: &Image) -> Vec<[f64; 2]> {
 /// reference's noise included. Six of those in about 5500 blocks, twice: wrong once in 40 000 runs if the noise of 256
 /// pixels is normal and there is no bias. References are rounded to half floats, and their rays begin elsewhere on curved
 /// things: the exact method with 512 samples of 16 rays is off by 0.00028 in a block of bunny_penumbra, by what `auto` is to
-/// the sixth digit. What is less than 1/256 of the picture's mean is left at that.
+/// the sixth digit. What is less than 1/256 of the picture's mean is left at
+/// that; of an adaptive picture, whose few samples in calm places have heavy tails, 1/100.
 #[test]
 fn shared_scenes_come_out_like_their_references() {
     let shared =
@@ -658,7 +659,8 @@ fn shared_scenes_come_out_like_their_references() {
             let ratio = found.mean_ratio_all;
             let off = (ratio.ratio - 1.0).abs() - 1.0 / 2048.0;
             assert!(off < 5.0 * ratio.standard_error, "{what}: {ratio:?}");
-            let slack = found.mean_reference.iter().sum::<f64>() / 3.0 / 256.0;
+            let part = if adaptive { 100.0 } else { 256.0 };
+            let slack = found.mean_reference.iter().sum::<f64>() / 3.0 / part;
             let biases = block_biases(&image, &reference);
             let worst = biases.iter().map(|[_, z]| z.abs()).fold(0.0, f64::max);
             for (block, [bias, z]) in biases.iter().enumerate() {
