@@ -607,6 +607,57 @@ fn adaptive_pictures_are_right_on_average_and_the_same_for_any_number_of_threads
     }
 }
 
+/// What a pixel gets in a round follows from what it saw before, so a round must know nothing of earlier ones: neither where
+/// their samples lay nor what of a light they were short of. Small pictures full of edges, of many seeds, adaptive against
+/// plain with seeds of their own: the mean of each pixel, that of all, and the mean square of 384 standard scores. Five and a
+/// half standard errors each, of normal distributions: wrong once in 30 000 runs if there is no bias. With rounds that go on
+/// with one sequence the scores' mean square is 2.4 and the worst 11, with three times as many seeds.
+#[test]
+fn rounds_know_nothing_of_each_other() {
+    const RUNS: u64 = 2000;
+    let setting = Setting::own("columns", (24, 16));
+    let size = (setting.camera.width, setting.camera.height);
+    let sums = |exact: bool, adaptive: bool, first: u64| -> Vec<[f64; 2]> {
+        let run = |seed| {
+            setting.with_stage(4, detect(), |stage| {
+                let stage = Stage { seed, ..*stage };
+                let method: Box<dyn Visibility> =
+                    if exact { Box::new(Exact) } else { Box::new(Auto::new(AutoOptions::default())) };
+                let (limits, stop) = (Limits { passes: 12, time: None }, AtomicBool::new(false));
+                let render = if adaptive { render_adaptively } else { render };
+                let film = render(&stage, &*method, size, limits, 1, &stop, |_| ()).expect("a thread").film;
+                film.develop().pixels.iter().map(|p| f64::from(p[0])).collect()
+            })
+        };
+        let halves = [first..first + RUNS / 2, first + RUNS / 2..first + RUNS];
+        let runs: Vec<Vec<f64>> = std::thread::scope(|scope| {
+            let threads = halves.map(|seeds| scope.spawn(|| seeds.map(run).collect::<Vec<Vec<f64>>>()));
+            threads.into_iter().flat_map(|thread| thread.join().expect("no panic")).collect()
+        });
+        let n = RUNS as f64;
+        (0..runs[0].len())
+            .map(|at| {
+                let mean = runs.iter().map(|run| run[at]).sum::<f64>() / n;
+                [mean, runs.iter().map(|run| (run[at] - mean).powi(2)).sum::<f64>() / (n - 1.0) / n]
+            })
+            .collect()
+    };
+    let plain = sums(true, false, 0);
+    for exact in [true, false] {
+        let found = sums(exact, true, 10_000);
+        let z = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]) / (a[1] + b[1]).sqrt().max(1e-9);
+        let scores: Vec<f64> = found.iter().zip(&plain).map(|(a, b)| z(*a, *b)).collect();
+        let worst = scores.iter().map(|z| z.abs()).fold(0.0, f64::max);
+        let n = scores.len() as f64;
+        let square = scores.iter().map(|z| z * z).sum::<f64>() / n;
+        let whole = |of: &[[f64; 2]]| of.iter().fold([0.0; 2], |sum, one| [sum[0] + one[0], sum[1] + one[1]]);
+        let (a, b) = (whole(&found), whole(&plain));
+        let what = format!("exact {exact}: z = {:.2}, {worst:.2} at worst, squared {square:.3}", z(a, b));
+        println!("{what}");
+        assert!(z(a, b).abs() < 5.5 && worst < 5.5 && square < 1.0 + 5.5 * (2.0 / n).sqrt(), "{what}");
+    }
+}
+
 /// Of each block of 16 by 16 pixels: the mean difference over the channels, and how many standard errors that is, by
 /// the spread of its pixels' differences.
 fn block_biases(image: &Image, reference: &Image) -> Vec<[f64; 2]> {
@@ -659,7 +710,7 @@ fn shared_scenes_come_out_like_their_references() {
             let ratio = found.mean_ratio_all;
             let off = (ratio.ratio - 1.0).abs() - 1.0 / 2048.0;
             assert!(off < 5.0 * ratio.standard_error, "{what}: {ratio:?}");
-            let part = if adaptive { 100.0 } else { 256.0 };
+            let part = if adaptive { 256.0 } else { 256.0 };
             let slack = found.mean_reference.iter().sum::<f64>() / 3.0 / part;
             let biases = block_biases(&image, &reference);
             let worst = biases.iter().map(|[_, z]| z.abs()).fold(0.0, f64::max);

@@ -40,7 +40,7 @@ pub(crate) const FEWEST: u32 = 2 * FIRST;
 /// What each of the first passes counts: where samples are needed most, theirs are few.
 pub(crate) const FIRST_WEIGHT: f64 = 0.05;
 
-/// What a camera sample costs beside its shadow rays, in shadow rays. Of twelve scenes at 16 rays, 6 to 24 do as well.
+/// What a camera sample costs beside its shadow rays, in shadow rays. Of nine scenes at 16 rays, 5 to 24 do as well.
 const CAMERA: f32 = 10.0;
 
 /// Times the passes of a round that a pixel can have as samples at most.
@@ -97,7 +97,7 @@ impl Seen {
         }
         let variance = self.deviation as f32 / (n - 1.0);
         let power = self.power / n;
-        // What single rays add cannot be told from edges, and counts as theirs.
+        // What single rays add cannot be told from edges: all that it may be counts as noise.
         let (known, unknown) =
             if heard.all > 0.0 { (heard.noise / n, 1.0 - heard.known / heard.all) } else { (0.0, 0.0) };
         let noise = known + unknown.clamp(0.0, 1.0) * (variance / power - known).max(0.0);

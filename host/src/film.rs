@@ -138,8 +138,9 @@ pub struct Heard {
 }
 
 impl Heard {
-    /// A batch of so many rays, of a sample that was due `due`. Of radiance 1 it saw `seen`, with a variance over `rays`
-    /// *independent* rays of `variance`; `full` is radiance times reflectance, squared.
+    /// A batch of so many rays, which stand for the part `share` of their light, of a sample that was due `due`. Of radiance 1 it
+    /// saw `seen`, which would have the variance `variance` with *independent* rays; `full` is radiance times reflectance,
+    /// squared.
     #[inline]
     pub fn batch(rays: usize, due: u32, share: f32, full: f32, seen: f32, variance: f32) -> Self {
         let (n, due) = (rays as f32, due as f32);

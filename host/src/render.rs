@@ -61,8 +61,8 @@ pub fn render(
 /// shadow rays made: at least one sample and at most 64 for each pass, of the usual number of shadow rays or of that halved
 /// some times. With fewer than eight passes, and until the first four are done, it is [`render`].
 ///
-/// Right on average: what a pixel gets follows from earlier rounds only, and a round counts by its number of passes, the
-/// first one for a twentieth of that, whatever was seen in it.
+/// Right on average: what a pixel gets follows from earlier rounds only, with which a round shares no random number, and a
+/// round counts by its number of passes, the first one for a twentieth of that, whatever was seen in it.
 pub fn render_adaptively(
     stage: &Stage<'_>,
     method: &dyn Visibility,
@@ -116,10 +116,10 @@ fn run(
         let tiles: Vec<_> = film.tiles().iter().map(TileFilm::tile).collect();
         method.begin(stage, &tiles, size.0);
         let mut needs = if adaptive { Needs::new(size.0, size.1) } else { Needs::new(0, 0) };
-        let mut had: Vec<Vec<u32>> = tiles.iter().map(|tile| vec![FIRST; tile.len()]).collect();
         // What the film counts.
         let mut weight = 0.0;
         let mut round: Option<Round> = None;
+        let mut rounds = 0;
         while passes < limits.passes && !stop.load(Ordering::Relaxed) && !(passes > 0 && out_of_time()) {
             if adaptive && passes >= FIRST && round.is_none() {
                 if passes == FIRST {
@@ -128,6 +128,7 @@ fn run(
                 }
                 let count = passes.min(limits.passes - passes);
                 let due = needs.share(&tiles, count, stage.shadow_rays);
+                rounds += 1;
                 round = Some(Round { film: new_film(), due, first: passes, passes: count });
             }
             let (target, plan) = match &mut round {
@@ -136,7 +137,6 @@ fn run(
                 }
                 None => (&mut film, None),
             };
-            let had_before = &had;
             target.tiles_mut().par_iter_mut().enumerate().for_each(|(index, tile)| {
                 if stop.load(Ordering::Relaxed) {
                     return;
@@ -146,7 +146,8 @@ fn run(
                 let mut scratch = own.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
                 let Some((due, pass, count)) = plan else {
                     let pixels = 0..tile.tile().len() as u32;
-                    let samples = pixels.map(|pixel| CameraSample { pixel, index: passes, rays: even_rays });
+                    let samples =
+                        pixels.map(|pixel| CameraSample { pixel, round: 0, index: passes, rays: even_rays });
                     render_samples(stage, method, size.0, samples, tile, &mut scratch);
                     return;
                 };
@@ -155,9 +156,8 @@ fn run(
                     (u64::from(samples) * u64::from(pass)).div_ceil(u64::from(count)) as u32
                 };
                 let samples = (0u32..).zip(&due[index]).flat_map(|(pixel, &Due { samples, rays })| {
-                    let before = had_before[index][pixel as usize];
-                    let range = before + until(samples, pass)..before + until(samples, pass + 1);
-                    range.map(move |index| CameraSample { pixel, index, rays: Some(rays) })
+                    let range = until(samples, pass)..until(samples, pass + 1);
+                    range.map(move |index| CameraSample { pixel, round: rounds, index, rays: Some(rays) })
                 });
                 render_samples(stage, method, size.0, samples, tile, &mut scratch);
             });
@@ -169,9 +169,6 @@ fn run(
                 film.merge(weight, &done.film, f64::from(done.passes));
                 weight += f64::from(done.passes);
                 needs.learn(&done.film, |tile, pixel| done.due[tile][pixel].rays);
-                for (had, due) in had.iter_mut().flatten().zip(done.due.iter().flatten()) {
-                    *had += due.samples;
-                }
             }
             method.passed(stage);
             passed(passes);

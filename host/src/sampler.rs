@@ -32,6 +32,12 @@ impl Sampler {
         Self(Xoshiro128PlusPlus::seed_from_u64(mix(mixed)))
     }
 
+    /// The seed of a round of samples: that of the render for the first one, and others, unlike it, for the rest.
+    #[inline]
+    pub fn seed_of_round(seed: u64, round: u32) -> u64 {
+        if round == 0 { seed } else { mix(seed ^ mix(0x3c6e_f372_fe94_f82b ^ u64::from(round))) }
+    }
+
     /// A generator of its own for each key.
     #[inline]
     pub fn from_key(key: u64) -> Self {

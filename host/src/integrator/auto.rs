@@ -237,9 +237,8 @@ const PHOTONS: u64 = 4;
 struct Told {
     /// Whether that is anything.
     changed: bool,
-    /// Samples that lights are due by their doubt, and these times their doubt.
+    /// Samples that lights are due by their doubt.
     sum: f32,
-    squares: f32,
     /// What the usual samples cost, and those that are due.
     costs: [f32; 2],
 }
@@ -253,7 +252,6 @@ impl Told {
     fn add(&mut self, usual: f32, doubt: f32) {
         self.changed |= doubt < 1.0;
         self.sum += usual * doubt;
-        self.squares += usual * doubt * doubt;
         let cost = doubt.max(LEAST_COST);
         self.costs[0] += usual * cost;
         self.costs[1] += usual * doubt * cost;
@@ -300,16 +298,8 @@ struct TilePast {
 /// What the points of a pass need, in whole numbers, so that sums do not depend on their order.
 #[derive(Clone, Copy, Debug, Default)]
 struct Needs {
-    /// Samples that they would get without a map.
-    usual: u64,
-    /// The same times their weights, which are due to doubt and brightness, and times the squares of these.
-    due: u64,
-    squares: u64,
-    /// What the usual samples cost, and those that are due.
+    /// What the usual samples cost, and those that are due to doubt and brightness.
     costs: [u64; 2],
-    /// What lights send unlike their mean makes of the variance, where they are seen, and what shadows make of it.
-    form: u64,
-    shadow: u64,
     /// What was seen of the error.
     gain: Gain,
     /// Whether rays were the points' own. Who shares them out counts on what is known of lights, and goes on having it.
@@ -326,14 +316,16 @@ const NEED: f32 = 4096.0;
 ///
 /// Well spread samples leave `v (1 - v) n^-1.5` where borders are long against their distance, and `n^-1` where fine things
 /// are in the way; which of both, a quarter of a light tells: it has half of the variance of the whole, or all of it.
+///
+/// A tile sums numbers, and tiles are summed in whole parts of [`FINE`], so that their order does not matter.
 #[derive(Clone, Copy, Debug, Default)]
-struct Gain {
+struct Gain<T = u64> {
     /// With the powers -1 and -1.5.
-    before: [u64; 2],
-    left: [u64; 2],
+    before: [T; 2],
+    left: [T; 2],
     /// Variances of a sample within quarters of a light, and in all of it.
-    quarters: u64,
-    whole: u64,
+    quarters: T,
+    whole: T,
 }
 
 /// Variances are counted in these parts.
@@ -342,16 +334,7 @@ const FINE: f64 = 4_294_967_296.0;
 /// Samples of a light before its quarters tell anything.
 const QUARTERED: f32 = 8.0;
 
-/// Sums of a tile, for [`Gain`].
-#[derive(Clone, Copy, Debug, Default)]
-struct TileGain {
-    before: [f64; 2],
-    left: [f64; 2],
-    quarters: f64,
-    whole: f64,
-}
-
-impl TileGain {
+impl Gain<f64> {
     /// Adds a batch of n samples, and `usual` otherwise, that saw `v` of squared light `light`; `forms` are what the form of
     /// the light adds to the variance, and what is left of that.
     #[inline(always)]
@@ -419,10 +402,6 @@ impl Gain {
     }
 }
 
-/// With less to gain than this, and with less of the variance due to the form of lights, the exact method does as well.
-const WORTH: f64 = 1.1;
-const FORM: f64 = 0.1;
-
 /// The variance has to fall by this where cells promise less than that: rays in doubt are dearer, and what was seen says a bit
 /// too much. (Soup sees 1.3, of which its passes need 1.2; forest and hair see 1.6.)
 const MUCH: f64 = 1.4;
@@ -432,23 +411,15 @@ const SOME: f64 = 1.2;
 const PATIENCE_WITH_ODDS: u32 = 3;
 
 impl Needs {
-    /// Adds a point that would get `usual` samples.
-    fn add(&mut self, usual: u32, told: &Told, bright: f32) {
-        self.usual += u64::from(usual) * NEED as u64;
-        self.due += (told.sum * bright * NEED) as u64;
-        self.squares += (told.squares * bright * bright * NEED) as u64;
+    /// Adds a point.
+    fn add(&mut self, told: &Told, bright: f32) {
         self.costs[0] += (told.costs[0] * NEED) as u64;
         self.costs[1] += (told.costs[1] * bright * NEED) as u64;
     }
 
     fn merge(&mut self, other: &Self) {
-        self.usual += other.usual;
-        self.due += other.due;
-        self.squares += other.squares;
         self.costs[0] += other.costs[0];
         self.costs[1] += other.costs[1];
-        self.form += other.form;
-        self.shadow += other.shadow;
         self.gain.merge(&other.gain);
         self.firm |= other.firm;
     }
@@ -457,14 +428,6 @@ impl Needs {
     fn scale(&self) -> f32 {
         let [usual, due] = self.costs;
         if due > 0 { usual as f32 / due as f32 } else { 1.0 }
-    }
-
-    /// Is there anything to gain? With deviations like the weights w, samples in proportion to them have a variance that
-    /// is `mean(w)² / mean(w²)` of that of even ones.
-    fn worth(&self) -> bool {
-        let mean = |sum: u64| sum as f64 / self.usual.max(1) as f64;
-        let form = self.form as f64 / (self.form + self.shadow).max(1) as f64;
-        mean(self.squares) > WORTH * mean(self.due).powi(2) || form > FORM
     }
 }
 
@@ -527,7 +490,7 @@ impl Map {
                 told.add(share.expected, near.map_or(1.0, |near| near.doubt(share.expected)));
             }
             let bright = brightness(stage, point.diffuse, shares, self.brightest);
-            needs.add(point.rays, &told, bright);
+            needs.add(&told, bright);
         }
         needs
     }
@@ -837,6 +800,7 @@ impl Auto {
         scratch.paths.clear();
         scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample {
             pixel,
+            round: 0,
             index: 0,
             rays: None,
         }));
@@ -941,7 +905,12 @@ impl Visibility for Auto {
                     let (x, y) = tile.position(pixel as usize);
                     x % 2 == 0 && y % 2 == 0
                 });
-                scratch.paths.extend(some.map(|pixel| CameraSample { pixel, index: 0, rays: None }));
+                scratch.paths.extend(some.map(|pixel| CameraSample {
+                    pixel,
+                    round: 0,
+                    index: 0,
+                    rays: None,
+                }));
                 cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
@@ -964,7 +933,7 @@ impl Visibility for Auto {
             .collect();
         let mut needs = Needs::default();
         looks.iter().for_each(|look| needs.merge(&look.2));
-        map.scale = (needs.usual > 0).then(|| needs.scale());
+        map.scale = (needs.costs[0] > 0).then(|| needs.scale());
         let points: usize = looks.iter().map(|look| look.1).sum();
         let strays: Vec<Stray> = looks.into_iter().flat_map(|look| look.0).collect();
         map.samples = f64::from(stage.shadow_rays) * points as f64 / strays.len().max(1) as f64;
@@ -1068,7 +1037,7 @@ impl Visibility for Auto {
                 }
             }
             let bright = brightness(stage, point.diffuse, shares, map.brightest);
-            needs.add(point.rays, &told, bright);
+            needs.add(&told, bright);
             needs.firm |= point.firm;
             let mut scale = map.scale.map(|scale| scale * bright);
             if point.firm && told.sum > 0.0 {
@@ -1115,7 +1084,7 @@ impl Visibility for Auto {
                     } else if !whole.is_nan()
                         && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                     {
-                        radiance[point.path as usize] += full * past.unasked(whole);
+                        radiance[point.path as usize] += full * past.unasked(whole, point.firm);
                     }
                     continue;
                 }
@@ -1161,7 +1130,7 @@ impl Visibility for Auto {
                 } else if open.is_finite()
                     && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                 {
-                    radiance[point.path as usize] += full * past.unasked(whole);
+                    radiance[point.path as usize] += full * past.unasked(whole, point.firm);
                 }
             }
         }
@@ -1199,15 +1168,14 @@ impl Visibility for Auto {
             }
         }
         let mut pasts = map.pasts_of(questions.place);
-        let (mut form, mut shadow) = (0.0f64, 0.0f64);
-        let mut sums = TileGain::default();
+        let mut sums = Gain::<f64>::default();
         for ((batch, &whole), &usual) in questions.batches.iter().zip(&questions.wholes).zip(&questions.usual)
         {
-            let pixel = questions.points[batch.point as usize].pixel;
+            let point = &questions.points[batch.point as usize];
             if whole.is_nan() {
                 continue;
             }
-            let Some(past) = past_of(&mut pasts, pixel, batch.light, map.remembered) else { continue };
+            let Some(past) = past_of(&mut pasts, point.pixel, batch.light, map.remembered) else { continue };
             let samples = batch.samples.start as usize..batch.samples.end as usize;
             let count = samples.len() as f32;
             let estimates = &mut estimates[samples.clone()];
@@ -1216,25 +1184,22 @@ impl Visibility for Auto {
             let v = (free / all).min(1.0);
             let bins = &questions.bins[batch.samples.start as usize..batch.samples.end as usize];
             past.mark(v, bins, estimates);
-            form += f64::from((v * off / all).powi(2));
-            shadow += f64::from(v * (1.0 - v) / (count * count.sqrt()));
-            if count > 1.0 {
+            // Where rays are the points' own, the map goes on in any case.
+            if count > 1.0 && !point.firm {
                 let radiance = stage.lights[batch.light as usize].radiance * (all / map.brightest);
-                let light = (questions.points[batch.point as usize].diffuse * radiance).length_squared();
+                let light = (point.diffuse * radiance).length_squared();
                 let form = |v: f32| (v * off / all).powi(2);
                 let whole = sums.add(light, v, [count, usual], [form(v), form(v - past.mean())]);
                 if whole > 0.0 && count >= QUARTERED && (batch.point + map.passes).is_multiple_of(4) {
                     sums.add_quarters(light, whole, bins, estimates);
                 }
             }
-            let more = past.asked(v, off) / all;
+            let more = past.asked(v, off, point.firm) / all;
             if more != 0.0 {
                 estimates.iter_mut().for_each(|estimate| *estimate += more);
             }
         }
         if let Some(pasts) = &mut pasts {
-            pasts.needs.form += (form * f64::from(NEED)) as u64;
-            pasts.needs.shadow += (shadow * f64::from(NEED)) as u64;
             pasts.needs.gain.merge(&sums.counted());
         }
         if doubts != Doubts::default() {
@@ -1254,7 +1219,7 @@ impl Visibility for Auto {
         }
         map.scale = (map.remembered > 0).then(|| needs.scale());
         map.seen += u64::from(stage.shadow_rays);
-        let helps = needs.gain.value().map_or_else(|| needs.worth(), |gain| gain > MUCH);
+        let helps = needs.gain.value().is_none_or(|gain| gain > MUCH);
         let all_doubt = map.passes >= PATIENCE_WITH_ODDS && map.promise < SOME;
         if !needs.firm && (map.asleep || all_doubt) {
             map.plain = !self.restless && (map.remembered == 0 || map.seen >= TELLING && !helps);
@@ -1297,7 +1262,7 @@ mod tests {
         let gain = |free: fn(u8) -> bool| {
             let estimates: Vec<f32> = bins.iter().map(|&bin| f32::from(u8::from(free(bin)))).collect();
             let v = estimates.iter().sum::<f32>() / 64.0;
-            let mut sums = TileGain::default();
+            let mut sums = Gain::<f64>::default();
             let whole = sums.add(1.0, v, [64.0, 16.0], [0.0; 2]);
             sums.add_quarters(1.0, whole, &bins, &estimates);
             (sums.counted().value().expect("both"), sums.quarters / sums.whole)
@@ -1308,36 +1273,28 @@ mod tests {
         let (fine, all) = gain(|bin| (bin ^ bin >> 3) & 1 == 0);
         assert!((all - 1.05).abs() < 0.03 && (fine - 4.0).abs() < 1e-3, "{fine} {all}");
         // What the light's form adds counts with either power, and nothing seen is nothing told.
-        let mut sums = TileGain::default();
+        let mut sums = Gain::<f64>::default();
         sums.add(2.0, 0.0, [8.0, 8.0], [0.5, 0.25]);
         assert_eq!(sums.counted().value(), Some(2.0));
-        assert_eq!(Gain::default().value(), None);
+        assert_eq!(Gain::<u64>::default().value(), None);
     }
 
     #[test]
-    fn needs_scale_to_the_usual_cost_and_tell_whether_weights_help() {
+    fn needs_scale_to_the_usual_cost() {
         let needs = |weights: [f32; 2]| {
             let mut needs = Needs::default();
             for &doubt in &weights {
                 let mut told = Told::default();
                 told.add(16.0, doubt);
-                needs.add(16, &told, 1.0);
+                needs.add(&told, 1.0);
             }
             needs
         };
         let unlike = needs([1.0, 0.25]);
         // The usual samples cost 16 + 16 / 4, those that are due 16 + (16 / 4) / 4.
         assert_eq!(unlike.scale(), 20.0 / 17.0);
-        assert!(unlike.worth());
-        let mut alike = needs([0.5, 0.5]);
-        assert_eq!(alike.scale(), 2.0);
-        assert!(!alike.worth());
-        (alike.form, alike.shadow) = (1, 10);
-        assert!(!alike.worth(), "9 % of the variance");
-        alike.form = 2;
-        assert!(alike.worth());
+        assert_eq!(needs([0.5, 0.5]).scale(), 2.0);
         assert_eq!(Needs::default().scale(), 1.0);
-        assert!(!Needs::default().worth());
         let mut both = needs([1.0, 1.0]);
         both.merge(&needs([0.25, 0.25]));
         assert_eq!(both.scale(), unlike.scale());

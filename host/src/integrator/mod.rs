@@ -209,7 +209,9 @@ impl std::ops::AddAssign for StageTimes {
 pub struct CameraSample {
     /// The pixel.
     pub pixel: u32,
-    /// The sample; those of a pixel are spread the better the fewer are left out.
+    /// The round. What a pixel gets in a round may follow from earlier ones, since rounds share no random number.
+    pub round: u32,
+    /// The sample in the round; those of a pixel are spread the better the fewer are left out.
     pub index: u32,
     /// Its shadow rays, over all lights together. Of `None` the usual number, which a method may share with other samples.
     pub rays: Option<u32>,
@@ -255,6 +257,7 @@ pub fn render_tile(
     scratch.paths.clear();
     scratch.paths.extend((0..film.tile().len() as u32).map(|pixel| CameraSample {
         pixel,
+        round: 0,
         index: pass,
         rays: None,
     }));
@@ -301,7 +304,12 @@ fn render_paths(
 /// What one pass over a tile asks: for benchmarks and tests of visibility alone.
 pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
     let mut scratch = Scratch::default();
-    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample { pixel, index: pass, rays: None }));
+    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample {
+        pixel,
+        round: 0,
+        index: pass,
+        rays: None,
+    }));
     cast(stage, tile, width, &mut scratch);
     sample_lights(stage, &mut scratch);
     scratch.questions
@@ -336,13 +344,14 @@ fn cast(stage: &Stage<'_>, tile: Tile, width: u32, scratch: &mut Scratch) {
     for first in (0..scratch.paths.len()).step_by(RayPacket::WIDTH) {
         let count = RayPacket::WIDTH.min(scratch.paths.len() - first);
         for lane in 0..count {
-            let CameraSample { pixel, index, .. } = scratch.paths[first + lane];
+            let CameraSample { pixel, round, index, .. } = scratch.paths[first + lane];
+            let seed = Sampler::seed_of_round(stage.seed, round);
             let (x, y) = tile.position(pixel as usize);
             let pixel = u64::from(y) * u64::from(width) + u64::from(x);
-            let at = Sampler::in_pixel(stage.seed, pixel, index);
+            let at = Sampler::in_pixel(seed, pixel, index);
             let (px, py) = (x as f32 + at[0], y as f32 + at[1]);
             rays.set(lane, &occlude_kernel::Ray::from(stage.eye, stage.camera.ray_direction(px, py)));
-            scratch.samplers.push(Sampler::new(stage.seed, pixel, index));
+            scratch.samplers.push(Sampler::new(seed, pixel, index));
         }
         let (bvh, rays, active) = (stage.bvh, &rays, (1u32 << count) - 1);
         let hits = if stage.count {

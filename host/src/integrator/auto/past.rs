@@ -15,7 +15,9 @@
 //! Before the first pass a pixel may have been told what to expect, by rays that no pass has part in: that counts as a part of
 //! a pass that v is taken from, and no c.
 //!
-//! On average `T_n` is 0, since c_p and v_q are of different passes and so of different random numbers.
+//! On average `T_n` is 0, since c_p and v_q are of different passes and so of different random numbers. But what a pass adds takes
+//! back from earlier ones, and is 0 on average only as long as the number of passes does not depend on these. Where it does,
+//! in adaptive renders, `u_p` is the mean over the *earlier* passes, and each `u_p c_p` is 0 on average whatever these were.
 
 /// Sums over the passes of a pixel and a light.
 #[derive(Clone, Copy, Debug, Default)]
@@ -35,14 +37,16 @@ pub(super) struct Past {
 }
 
 impl Past {
-    /// What a pass adds that saw the part `v`, with samples `c` short of the whole.
+    /// What a pass adds that saw the part `v`, with samples `c` short of the whole; `only_earlier` if other passes' parts
+    /// must be those of earlier ones.
     #[inline(always)]
-    pub(super) fn asked(&mut self, v: f32, c: f32) -> f32 {
+    pub(super) fn asked(&mut self, v: f32, c: f32, only_earlier: bool) -> f32 {
+        let expected = self.mean() * c;
         self.asked += 1.0;
         self.seen += v;
         self.off += c;
         self.both += v * c;
-        self.change()
+        if only_earlier { expected } else { self.change() }
     }
 
     /// Expects the part `v`, as if that had been seen in so much of a pass. Before any pass.
@@ -56,9 +60,9 @@ impl Past {
 
     /// What a pass adds that had no sample of the light, where all of it would send `c`.
     #[inline(always)]
-    pub(super) fn unasked(&mut self, c: f32) -> f32 {
+    pub(super) fn unasked(&mut self, c: f32, only_earlier: bool) -> f32 {
         self.unasked += c;
-        self.change()
+        if only_earlier { self.mean() * c } else { self.change() }
     }
 
     /// Notes in which bins samples were free and blocked.
@@ -233,6 +237,7 @@ pub(super) fn sums(weights: &[f32], estimates: &[f32]) -> [f32; 2] {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use std::collections::HashMap;
 
     /// Four passes, each with one of three outcomes at random: nothing asked, or samples whose c is 0 on average.
     #[test]
@@ -244,9 +249,12 @@ mod tests {
             [(None, 0.0), (Some(1.0), -0.3), (Some(1.0), 0.3)],
             [(None, 2.0), (Some(0.5), -1.5), (Some(0.125), -0.5)],
         ];
-        for (passes, foreseen) in
-            [(1, 0.0), (2, 0.0), (3, 0.0), (4, 0.0), (1, 0.5), (2, 0.5), (3, 0.125), (4, 0.5)]
+        let cases = [(1, 0.0), (2, 0.0), (3, 0.0), (4, 0.0), (1, 0.5), (2, 0.5), (3, 0.125), (4, 0.5)];
+        for ((passes, foreseen), only_earlier) in
+            cases.into_iter().flat_map(|case| [(case, false), (case, true)])
         {
+            // Of each history, what the last pass adds.
+            let mut last = HashMap::<usize, f32>::new();
             let (mut sum, mut most) = (0.0, 0.0f32);
             let cases = 3usize.pow(passes);
             for case in 0..cases {
@@ -257,10 +265,14 @@ mod tests {
                 let mut total = 0.0;
                 for (pass, of) in outcomes.iter().enumerate().take(passes as usize) {
                     let (seen, c) = of[case / 3usize.pow(pass as u32) % 3];
-                    total += match seen {
-                        Some(v) => past.asked(v, c),
-                        None => past.unasked(c),
+                    let more = match seen {
+                        Some(v) => past.asked(v, c, only_earlier),
+                        None => past.unasked(c, only_earlier),
                     };
+                    total += more;
+                    if pass + 1 == passes as usize {
+                        *last.entry(case % 3usize.pow(pass as u32)).or_default() += more;
+                    }
                 }
                 sum += total;
                 most = most.max(total.abs());
@@ -268,6 +280,9 @@ mod tests {
             assert!((sum / cases as f32).abs() < 1e-6, "{passes} passes: {sum}");
             // Of one pass with nothing foreseen there is nothing to take out.
             assert!(most > 0.1 || passes < 2 && foreseen == 0.0, "{passes} passes: {most}");
+            let alone = last.values().all(|more| more.abs() < 1e-6);
+            assert!(alone || !only_earlier, "{passes} passes: {last:?}");
+            assert!(!alone || only_earlier || passes < 2, "{passes} passes: what is taken back can be told");
         }
     }
 
@@ -276,8 +291,8 @@ mod tests {
         let (mut lit, mut dark) = (Past::default(), Past::default());
         let (mut total, mut black) = (0.0, 0.0);
         for mean in [0.9, 1.2, 0.7, 1.05] {
-            total += mean + lit.asked(1.0, 1.0 - mean);
-            black += dark.asked(0.0, 1.0 - mean);
+            total += mean + lit.asked(1.0, 1.0 - mean, false);
+            black += dark.asked(0.0, 1.0 - mean, false);
         }
         assert!((total - 4.0f32).abs() < 1e-5 && black == 0.0, "{total} {black}");
     }
@@ -313,7 +328,7 @@ mod tests {
         let mut pasts = vec![Past::default(); 9];
         for past in &mut pasts {
             for _ in 0..2 {
-                past.asked(0.5, 0.0);
+                past.asked(0.5, 0.0, false);
                 past.mark(0.5, &(0..64).collect::<Vec<u8>>(), &[[1.0; 32], [0.0; 32]].concat());
             }
         }
