@@ -56,13 +56,14 @@ pub fn render(
 /// The same for about the same work, but with camera samples where the picture is not sure yet, and with no more shadow
 /// rays for each than help there.
 ///
-/// In rounds: after four passes over everything, with a quarter of the shadow rays, each round costs as much as all passes
-/// before it. What it gives a pixel follows from the variance that was seen in it and around it, and from what part of that
-/// shadow rays made: at least one sample and at most 64 for each pass, of the usual number of shadow rays or of that halved
-/// some times. With fewer than eight passes, and until the first four are done, it is [`render`].
+/// In rounds: after four passes over everything, with a quarter of the shadow rays, rounds end at a quarter of the passes,
+/// at a quarter of these and so on, so that each costs about three times what all before it did. What it gives a pixel
+/// follows from the variance that was seen in it and around it, and from what part of that shadow rays made: at least one
+/// sample and at most 256 for each pass, of the usual number of shadow rays or of that halved some times. With fewer than
+/// eight passes, and until the first four are done, it is [`render`].
 ///
 /// Right on average: what a pixel gets follows from earlier rounds only, with which a round shares no random number, and a
-/// round counts by its number of passes, the first one for a twentieth of that, whatever was seen in it.
+/// round counts by its number of passes, whatever was seen in it.
 pub fn render_adaptively(
     stage: &Stage<'_>,
     method: &dyn Visibility,
@@ -73,6 +74,23 @@ pub fn render_adaptively(
     passed: impl FnMut(u32) + Send,
 ) -> crate::Result<Rendered> {
     run(stage, method, size, limits, threads, stop, true, passed)
+}
+
+/// How many passes the round after so many has, of so many in all.
+///
+/// Samples of one round are spread over the pixel, those of two know nothing of each other: few rounds, the last of them
+/// large, have up to half the squared error of rounds that double.
+fn round_after(passes: u32, all: u32) -> u32 {
+    let mut end = all;
+    while end / 4 >= (2 * FIRST).max(passes + 1) {
+        end /= 4;
+    }
+    end - passes
+}
+
+/// What a round of so many passes counts: well spread samples have a variance of about this power of their number.
+fn weight_of_round(passes: u32) -> f64 {
+    f64::from(passes).powf(1.5)
 }
 
 /// A round under way.
@@ -126,7 +144,7 @@ fn run(
                     needs.learn(&film, |_, _| even_rays.unwrap_or(stage.shadow_rays));
                     weight = FIRST_WEIGHT * f64::from(FIRST);
                 }
-                let count = passes.min(limits.passes - passes);
+                let count = round_after(passes, limits.passes);
                 let due = needs.share(&tiles, count, stage.shadow_rays);
                 rounds += 1;
                 round = Some(Round { film: new_film(), due, first: passes, passes: count });
@@ -166,8 +184,9 @@ fn run(
             }
             passes += 1;
             if let Some(done) = round.take_if(|round| passes == round.first + round.passes) {
-                film.merge(weight, &done.film, f64::from(done.passes));
-                weight += f64::from(done.passes);
+                let its = weight_of_round(done.passes);
+                film.merge(weight, &done.film, its);
+                weight += its;
                 needs.learn(&done.film, |tile, pixel| done.due[tile][pixel].rays);
             }
             method.passed(stage);
@@ -175,7 +194,7 @@ fn run(
         }
         // Of a round that was broken off, whole passes count, and so do tiles of one more.
         if let Some(broken) = round {
-            let its = f64::from((passes - broken.first).max(1));
+            let its = weight_of_round((passes - broken.first).max(1));
             // One that has hardly begun is no better than the first passes.
             let weight = if broken.first == FIRST { its.max(1.0) } else { weight };
             film.merge(weight, &broken.film, its);
@@ -198,4 +217,28 @@ fn run(
         rendered.shadow_counts += scratch.shadow_counts;
     }
     Ok(rendered)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn rounds_end_where_the_passes_do_and_the_last_is_the_largest() {
+        for (all, ends) in [
+            (8, &[8][..]),
+            (16, &[16]),
+            (31, &[31]),
+            (32, &[8, 32]),
+            (100, &[25, 100]),
+            (256, &[16, 64, 256]),
+            (u32::MAX, &[15, 63, 255, 1023]),
+        ] {
+            let mut passes = FIRST;
+            for &end in ends {
+                passes += round_after(passes, all);
+                assert_eq!(passes, end, "of {all}");
+            }
+        }
+    }
 }

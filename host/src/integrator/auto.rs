@@ -267,10 +267,6 @@ const PILOT_KEY: u64 = 0x510e_527f_ade6_82d1;
 /// what it would be.
 const MOST_MORE: f32 = 8.0;
 
-/// Of rays that are its own a point gets this part at least, however little its lights are in doubt: where they are few, what
-/// is left of them would count too much.
-const LEAST_OWN: f32 = 0.5;
-
 /// Nor more than this, unless that is usual: what a tile asks is in memory at once.
 const MOST_RAYS: f32 = 2048.0;
 
@@ -1042,8 +1038,10 @@ impl Visibility for Auto {
             let mut scale = map.scale.map(|scale| scale * bright);
             if point.firm && told.sum > 0.0 {
                 let unproven = known.iter().zip(&usual).filter(|((thought, _), _)| *thought != Known::Lit);
+                // All of them, however little its lights are in doubt: where they are few, what is left of them would count
+                // too much.
                 let own = unproven.map(|(_, usual)| usual).sum::<f32>() / told.sum;
-                scale = Some(scale.unwrap_or(own).max(own * LEAST_OWN));
+                scale = Some(scale.unwrap_or(own).max(own));
             }
             if let Some(scale) = scale {
                 told.changed = true;
