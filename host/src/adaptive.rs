@@ -113,11 +113,11 @@ impl Seen {
         }
         let variance = self.deviation as f32 / (n - 1.0);
         let power = self.power / n;
-        // What single rays add cannot be told from edges: as much as others do for the same light, or all that it may be.
+        // What single rays add cannot be told from edges: all that it may be counts as noise.
         let (known, unknown) =
             if heard.all > 0.0 { (heard.noise / n, 1.0 - heard.known / heard.all) } else { (0.0, 0.0) };
-        let most = known + unknown.clamp(0.0, 1.0) * (variance / power - known).max(0.0);
-        let noise = if heard.known > 0.0 { most.min(known * heard.all / heard.known) } else { most };
+        let more = unknown.clamp(0.0, 1.0) * (variance / power - known).max(0.0);
+        let noise = known + more.min(heard.most / n);
         Model {
             edge: (variance - noise * power).max(0.0),
             noise,
@@ -243,10 +243,12 @@ impl Needs {
     }
 
     /// What the pixels of the tiles are due in a round that costs as much as so many passes of the usual rays; each has one
-    /// sample at least.
-    pub(crate) fn share(&self, tiles: &[Tile], passes: u32, usual: u32) -> Vec<Vec<Due>> {
+    /// sample at least. If it is the last one samples may have a single ray, which tells nothing that later ones could use.
+    pub(crate) fn share(&self, tiles: &[Tile], passes: u32, usual: u32, last: bool) -> Vec<Vec<Due>> {
         let models = self.models();
-        let halves = std::iter::successors(Some(usual.max(1)), |&rays| (rays > 1).then_some(rays / 2));
+        let least = if last { 1 } else { first_rays(usual) };
+        let half = |rays: &u32| Some(rays / 2).filter(|half| *half >= least);
+        let halves = std::iter::successors(Some(usual.max(1)), half);
         let choices: Vec<f32> = halves.map(|rays| rays as f32).collect();
         let most = (MOST * passes as f32).log2().floor().exp2();
         // Sums in the order of pixels, whatever the threads.
@@ -296,7 +298,7 @@ mod tests {
     /// A pixel whose samples have so much variance of edges and, at one ray, of rays; ten samples of four rays.
     fn seen(edge: f32, noise: f32) -> Seen {
         let variance = f64::from(edge + noise / 8.0);
-        let heard = Heard { rays: 40.0, all: 10.0, known: 10.0, noise: 10.0 * noise, each: 2.5 };
+        let heard = Heard { rays: 40.0, all: 10.0, known: 10.0, noise: 10.0 * noise, most: 0.0, each: 2.5 };
         let mut seen = Seen::default();
         seen.add(10, 4, (DVec3::ONE, 9.0 * variance), &heard);
         seen
@@ -311,16 +313,14 @@ mod tests {
         let model = seen(2.0, 16.0).model();
         assert!((model.edge - 2.0).abs() < 1e-5 && (model.noise - 16.0).abs() < 1e-5, "{model:?}");
         assert_eq!(model.asked, 1.0);
-        // Of batches of one ray nothing is known: all of the variance may be theirs.
+        // Of batches of one ray nothing is known: all of the variance may be theirs, but no more than the square of what they saw.
         let mut single = seen(2.0, 16.0);
-        (single.heard.known, single.heard.noise) = (0.0, 0.0);
+        (single.heard.known, single.heard.noise, single.heard.most) = (0.0, 0.0, 1e6);
         let model = single.model();
         assert!(model.edge < 1e-4 && (model.noise - 32.0).abs() < 1e-4, "{model:?}");
-        // Of half of them: the others are like these.
-        let mut half = seen(2.0, 16.0);
-        (half.heard.known, half.heard.noise) = (5.0, 80.0);
-        let model = half.model();
-        assert!((model.edge - 2.0).abs() < 1e-5 && (model.noise - 16.0).abs() < 1e-5, "{model:?}");
+        single.heard.most = 80.0;
+        let model = single.model();
+        assert!((model.edge - 3.0).abs() < 1e-4 && (model.noise - 8.0).abs() < 1e-4, "{model:?}");
     }
 
     #[test]
@@ -345,7 +345,7 @@ mod tests {
         (pixels[8], pixels[40]) = (seen(10.0, 0.01), seen(0.01, 10.0));
         let tiles = [Tile { x: 0, y: 0, width: 32, height: 1 }, Tile { x: 32, y: 0, width: 32, height: 1 }];
         for (passes, usual) in [(8, 16), (4, 64), (100, 1)] {
-            let shares = needs(&pixels).share(&tiles, passes, usual);
+            let shares = needs(&pixels).share(&tiles, passes, usual, true);
             assert!(shares.iter().flatten().all(|due| due.samples >= 1 && (1..=usual).contains(&due.rays)));
             assert!(shares.iter().flatten().all(|due| due.samples < 7 || due.samples.is_power_of_two()));
             let cost: f32 =
@@ -357,6 +357,8 @@ mod tests {
                 edge.samples > 4 * calm.samples.max(2) && noisy.samples > calm.samples,
                 "{edge:?} {noisy:?} {calm:?}"
             );
+            let before = needs(&pixels).share(&tiles, passes, usual, false);
+            assert!(before.iter().flatten().all(|due| (first_rays(usual)..=usual).contains(&due.rays)));
             assert!(edge.rays <= noisy.rays && noisy.rays == usual && (usual == 1 || edge.rays < usual));
         }
     }
@@ -365,10 +367,13 @@ mod tests {
     fn where_all_is_alike_all_get_about_the_same_and_black_is_no_trouble() {
         for pixel in [seen(0.0, 0.0), seen(1.0, 1.0), Seen::default()] {
             let tiles = [Tile { x: 0, y: 0, width: 5, height: 1 }];
-            let shares = needs(&[pixel; 5]).share(&tiles, 4, 16);
+            let shares = needs(&[pixel; 5]).share(&tiles, 4, 16, true);
             let rays = shares[0][0].rays;
-            assert!(shares[0].iter().all(|due| due.rays == rays && (4..=8).contains(&due.samples)), "{shares:?}");
+            assert!(
+                shares[0].iter().all(|due| due.rays == rays && (4..=8).contains(&due.samples)),
+                "{shares:?}"
+            );
         }
-        assert!(Needs::new(0, 0).share(&[], 4, 16).is_empty());
+        assert!(Needs::new(0, 0).share(&[], 4, 16, true).is_empty());
     }
 }

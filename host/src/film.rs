@@ -133,6 +133,8 @@ pub struct Heard {
     pub known: f32,
     /// The variance that rays made in those, times the power 1.5 of the rays of the sample.
     pub noise: f32,
+    /// The most that it can be in the others.
+    pub most: f32,
     /// All of the light times the rays of the sample, over those of the batch.
     pub each: f32,
 }
@@ -147,9 +149,13 @@ impl Heard {
         let square = full * seen * seen;
         let all = square / share;
         // Spread rays make less, by the root of their number.
-        let (known, noise) =
-            if rays > 1 { (all, full * variance.max(0.0) * due * (due / n).sqrt()) } else { (0.0, 0.0) };
-        Self { rays: n, all, known, noise, each: square * due / n }
+        let spread = due * (due / n).sqrt();
+        let (known, noise, most) = if rays > 1 {
+            (all, full * variance.max(0.0) * spread, 0.0)
+        } else {
+            (0.0, 0.0, square * spread)
+        };
+        Self { rays: n, all, known, noise, most, each: square * due / n }
     }
 }
 
@@ -159,6 +165,7 @@ impl std::ops::AddAssign for Heard {
         self.all += other.all;
         self.known += other.known;
         self.noise += other.noise;
+        self.most += other.most;
         self.each += other.each;
     }
 }

@@ -145,7 +145,8 @@ fn run(
                     weight = FIRST_WEIGHT * f64::from(FIRST);
                 }
                 let count = round_after(passes, limits.passes);
-                let due = needs.share(&tiles, count, stage.shadow_rays);
+                let last = passes + count == limits.passes;
+                let due = needs.share(&tiles, count, stage.shadow_rays, last);
                 rounds += 1;
                 round = Some(Round { film: new_film(), due, first: passes, passes: count });
             }
