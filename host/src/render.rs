@@ -195,9 +195,10 @@ fn run(
         }
         // Of a round that was broken off, whole passes count, and so do tiles of one more.
         if let Some(broken) = round {
-            let its = weight_of_round((passes - broken.first).max(1));
+            let done = (passes - broken.first).max(1);
+            let its = weight_of_round(done);
             // One that has hardly begun is no better than the first passes.
-            let weight = if broken.first == FIRST { its.max(1.0) } else { weight };
+            let weight = if broken.first == FIRST && done < FIRST { its } else { weight };
             film.merge(weight, &broken.film, its);
         }
     });
