@@ -44,14 +44,16 @@ pub(crate) const FIRST_WEIGHT: f64 = 0.05;
 /// What a camera sample costs beside its shadow rays, in shadow rays. Of nine scenes at 16 rays, 5 to 24 do as well.
 const CAMERA: f32 = 10.0;
 
-/// Times the passes of a round that a pixel can have as samples at most.
-const MOST: f32 = 256.0;
+/// Times the passes of a round that a pixel can have as samples at most, from and to, so that the rays of one pass of a pixel
+/// are no more than so many, unless they are with the fewest: what a tile asks in a pass is in memory at once.
+const MOST: [u32; 2] = [16, 256];
+const MOST_RAYS: u32 = 16_384;
 
 /// More samples than this are rounded to a power of two, which leaves 0.87 of the squared error.
 const AS_THEY_ARE: f32 = 6.0;
 
-/// That numbers, or powers of two, are rounded up half this sooner or later, from pixel to pixel, lets the work be shared out to the end
-/// where pixels are alike.
+/// Numbers, or powers of two, are rounded up half this sooner or later, from pixel to pixel, so that work is shared out to
+/// the end where pixels are alike.
 const TIES: f32 = 0.25;
 
 /// A pixel counts as if this part of the mean deviation were its own, so that what no sample has found yet is found.
@@ -111,18 +113,20 @@ impl Seen {
         if n < 2.0 {
             return Model::default();
         }
-        let variance = self.deviation as f32 / (n - 1.0);
+        let variance = (self.deviation / f64::from(n - 1.0)) as f32;
         let power = self.power / n;
         // What single rays add cannot be told from edges: all that it may be counts as noise.
         let (known, unknown) =
             if heard.all > 0.0 { (heard.noise / n, 1.0 - heard.known / heard.all) } else { (0.0, 0.0) };
         let more = unknown.clamp(0.0, 1.0) * (variance / power - known).max(0.0);
         let noise = known + more.min(heard.most / n);
+        // What is not finite, of light that is not, must not tell others what they get.
+        let finite = |x: f32| if x.is_finite() { x } else { 0.0 };
         Model {
-            edge: (variance - noise * power).max(0.0),
-            noise,
-            all: heard.all / n,
-            each: heard.each / n,
+            edge: finite((variance - noise * power).max(0.0)),
+            noise: finite(noise),
+            all: finite(heard.all / n),
+            each: finite(heard.each / n),
             asked: heard.rays / self.due,
         }
     }
@@ -192,10 +196,12 @@ impl Needs {
 
     /// Counts bright pixels less: squared errors over `1 + L / typical`, so that lights in sight do not take all there is.
     fn dim(&self, models: &mut [Model]) {
-        let light = |seen: &Seen| seen.mean.element_sum().max(0.0);
+        let light = |seen: &Seen| {
+            let light = seen.mean.element_sum();
+            if light.is_finite() { light.max(0.0) } else { 0.0 }
+        };
         let roots: f64 = self.seen.iter().map(|seen| light(seen).sqrt()).sum();
         let typical = (roots / self.seen.len().max(1) as f64).powi(2);
-        // Not a number in a picture that is not one.
         if typical > 0.0 {
             for (model, seen) in models.iter_mut().zip(&self.seen) {
                 let counts = (1.0 / (1.0 + light(seen) / typical)) as f32;
@@ -250,7 +256,8 @@ impl Needs {
         let half = |rays: &u32| Some(rays / 2).filter(|half| *half >= least);
         let halves = std::iter::successors(Some(usual.max(1)), half);
         let choices: Vec<f32> = halves.map(|rays| rays as f32).collect();
-        let most = (MOST * passes as f32).log2().floor().exp2();
+        let most =
+            ((MOST_RAYS / usual.max(1)).clamp(MOST[0], MOST[1]) as f32 * passes as f32).log2().floor().exp2();
         // Sums in the order of pixels, whatever the threads.
         let sum = |costs: Vec<f32>| costs.into_iter().map(f64::from).sum::<f64>();
         let budget = sum(models.iter().map(|model| model.cost(usual as f32)).collect()) * f64::from(passes);
@@ -259,7 +266,7 @@ impl Needs {
         let mut scale = 1.0f32;
         for _ in 0..TURNS {
             let costs = due.par_iter_mut().zip(&models).with_min_len(1024).map(|(due, model)| {
-                *due = model.choose(&choices, (due.0 * scale).clamp(1.0, most));
+                *due = model.choose(&choices, (due.0 * scale).max(1.0).min(most));
                 due.0 * model.cost(due.1)
             });
             scale = scaled(sum(costs.collect()));
@@ -272,7 +279,8 @@ impl Needs {
             } else {
                 (samples + later).round()
             };
-            whole.clamp(1.0, most)
+            // One if it is not a number.
+            whole.max(1.0).min(most)
         };
         // Between half and twice as much, by halves.
         let (mut low, mut high) = (0.5 * scale, 2.0 * scale);
@@ -313,7 +321,8 @@ mod tests {
         let model = seen(2.0, 16.0).model();
         assert!((model.edge - 2.0).abs() < 1e-5 && (model.noise - 16.0).abs() < 1e-5, "{model:?}");
         assert_eq!(model.asked, 1.0);
-        // Of batches of one ray nothing is known: all of the variance may be theirs, but no more than the square of what they saw.
+        // Of batches of one ray nothing is known: all of the variance may be theirs, but no more than the square of what
+        // they saw.
         let mut single = seen(2.0, 16.0);
         (single.heard.known, single.heard.noise, single.heard.most) = (0.0, 0.0, 1e6);
         let model = single.model();
@@ -375,5 +384,31 @@ mod tests {
             );
         }
         assert!(Needs::new(0, 0).share(&[], 4, 16, true).is_empty());
+    }
+
+    #[test]
+    fn light_that_is_no_number_leaves_the_others_theirs() {
+        let heard = |x: f32| Heard { rays: 40.0, all: x, known: x, noise: x, most: 0.0, each: x };
+        for bad in [f64::NAN, f64::INFINITY, 1e60] {
+            let mut pixels = vec![seen(1.0, 1.0); 16];
+            pixels[3] = Seen::default();
+            pixels[3].add(10, 4, (DVec3::splat(bad), bad), &heard(bad as f32));
+            pixels[4].heard.noise = f32::INFINITY;
+            let tiles = [Tile { x: 0, y: 0, width: 16, height: 1 }];
+            let shares = needs(&pixels).share(&tiles, 8, 16, true);
+            assert!(shares[0].iter().all(|due| due.samples >= 1), "{bad}: {shares:?}");
+            assert!(shares[0][8..].iter().all(|due| (2..=32).contains(&due.samples)), "{bad}: {shares:?}");
+        }
+    }
+
+    #[test]
+    fn with_many_rays_no_pixel_has_too_many_samples() {
+        let mut pixels = vec![seen(0.0, 0.0); 4096];
+        pixels[8] = seen(1e6, 1e6);
+        let tiles = [Tile { x: 0, y: 0, width: 4096, height: 1 }];
+        for (usual, most) in [(1, 256), (64, 256), (256, 64), (1024, 16), (65_536, 16)] {
+            let due = needs(&pixels).share(&tiles, 4, usual, true)[0][8];
+            assert_eq!(due.samples, 4 * most, "{usual} rays: {due:?}");
+        }
     }
 }

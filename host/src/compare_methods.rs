@@ -169,7 +169,7 @@ impl<'a> Runner<'a> {
                 which((y * width + x) as usize)
             };
             let samples = (0..pixels.len() as u32).filter(counts);
-            let samples = samples.map(|pixel| CameraSample { pixel, round: 0, index: pass, rays: None });
+            let samples = samples.map(|pixel| CameraSample::even(pixel, pass));
             render_samples(stage, &self.visibility, width, samples, tile, &mut scratch);
         }
         asking(&scratch.times)

@@ -224,7 +224,7 @@ impl TileFilm {
         (self.pixels[pixel].mean, self.pixels[pixel].deviation.element_sum())
     }
 
-    /// How many passes a pixel has had.
+    /// How many samples a pixel has had.
     ///
     /// # Panics
     /// If the tile has no such pixel.
@@ -266,7 +266,7 @@ impl Film {
         Self { width, height, tiles }
     }
 
-    /// The same that listens to what the shadow rays of each pixel are like: 20 bytes a pixel more.
+    /// The same that listens to what the shadow rays of each pixel are like: 24 bytes a pixel more.
     pub fn listening(mut self) -> Self {
         for tile in &mut self.tiles {
             tile.heard = vec![Heard::default(); tile.pixels.len()];
@@ -319,9 +319,10 @@ impl Film {
         self.image(|pixel| pixel.mean)
     }
 
-    /// The variance of each pixel of [`Film::develop`]: that of a pass, divided by the number of passes.
+    /// The variance of each pixel of [`Film::develop`]: that of a sample, divided by the number of samples, and of
+    /// [merged](Film::merge) films by the weight of each.
     ///
-    /// Estimated from the passes themselves, so 0, which here means *unknown*, where there were fewer
+    /// Estimated from the samples themselves, so 0, which here means *unknown*, where there were fewer
     /// than two: see [`Film::passes`].
     pub fn variance_of_mean(&self) -> Image {
         self.image(Accumulator::variance_of_mean)

@@ -56,11 +56,12 @@ pub fn render(
 /// The same for about the same work, but with camera samples where the picture is not sure yet, and with no more shadow
 /// rays for each than help there.
 ///
-/// In rounds: after four passes over everything, with a quarter of the shadow rays, rounds end at a quarter of the passes,
-/// at a quarter of these and so on, so that each costs about three times what all before it did. What it gives a pixel
-/// follows from the variance that was seen in it and around it, and from what part of that shadow rays made: at least one
-/// sample and at most 256 for each pass, of the usual number of shadow rays or of that halved some times. With fewer than
-/// eight passes, and until the first four are done, it is [`render`].
+/// In rounds: after four passes over everything, with a quarter of the shadow rays or four, rounds end at a quarter of the
+/// passes, at a quarter of these and so on, so that each costs about three times what all before it did, but the first one
+/// to seven times. What a round gives a pixel follows from the variance that was seen in it and around it, and from what
+/// part of that shadow rays made: at least one sample and at most 256 times its passes (16 384 over the usual rays, from 16
+/// on, if that is less), of the usual number of shadow rays or of that halved some times. With fewer than eight passes it
+/// is [`render`].
 ///
 /// Right on average: what a pixel gets follows from earlier rounds only, with which a round shares no random number, and a
 /// round counts by its number of passes, whatever was seen in it.
@@ -141,7 +142,7 @@ fn run(
         while passes < limits.passes && !stop.load(Ordering::Relaxed) && !(passes > 0 && out_of_time()) {
             if adaptive && passes >= FIRST && round.is_none() {
                 if passes == FIRST {
-                    needs.learn(&film, |_, _| even_rays.unwrap_or(stage.shadow_rays));
+                    needs.learn(&film, |_, _| first_rays(stage.shadow_rays));
                     weight = FIRST_WEIGHT * f64::from(FIRST);
                 }
                 let count = round_after(passes, limits.passes);

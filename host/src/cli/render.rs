@@ -38,7 +38,8 @@ pub struct RenderArgs {
     #[arg(long, default_value_t = 16, value_name = "P", value_parser = clap::value_parser!(u32).range(1..))]
     spp: u32,
 
-    /// Shadow rays a camera sample, over all lights together; with --method auto about so many on average.
+    /// Shadow rays a camera sample, over all lights together; with --method auto about so many on average, and with
+    /// --adaptive on so many at most.
     #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
     shadow_rays: u32,
 

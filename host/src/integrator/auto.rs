@@ -14,7 +14,8 @@
 //! or dark all around to penumbrae, and by the root of what arrives there at most. Rays in penumbrae take longer, so a
 //! pass has somewhat fewer than it would have without a map.
 //!
-//! Where neither promises anything, in pictures that are penumbra all over and alike, all is left to the exact method.
+//! Where neither promises anything, in pictures that are penumbra all over and alike, all is left to the exact method, but
+//! for points whose rays are their own.
 
 mod draws;
 mod past;
@@ -375,12 +376,13 @@ impl Gain<f64> {
 
 impl Gain {
     fn merge(&mut self, other: &Self) {
+        let add = |sum: &mut u64, more: u64| *sum = sum.saturating_add(more);
         for k in 0..2 {
-            self.before[k] += other.before[k];
-            self.left[k] += other.left[k];
+            add(&mut self.before[k], other.before[k]);
+            add(&mut self.left[k], other.left[k]);
         }
-        self.quarters += other.quarters;
-        self.whole += other.whole;
+        add(&mut self.quarters, other.quarters);
+        add(&mut self.whole, other.whole);
     }
 
     /// How many times less variance there is than the usual samples would leave; none if that cannot be told.
@@ -794,12 +796,7 @@ impl Auto {
         let map = self.map.read().unwrap_or_else(|poisoned| poisoned.into_inner());
         let view = map.view();
         scratch.paths.clear();
-        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample {
-            pixel,
-            round: 0,
-            index: 0,
-            rays: None,
-        }));
+        scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample::even(pixel, 0)));
         cast(&Stage { count: false, ..*stage }, tile, width, scratch);
         let mut seen = vec![[f32::NAN; 3]; tile.len()];
         for point in &scratch.questions.points {
@@ -901,12 +898,7 @@ impl Visibility for Auto {
                     let (x, y) = tile.position(pixel as usize);
                     x % 2 == 0 && y % 2 == 0
                 });
-                scratch.paths.extend(some.map(|pixel| CameraSample {
-                    pixel,
-                    round: 0,
-                    index: 0,
-                    rays: None,
-                }));
+                scratch.paths.extend(some.map(|pixel| CameraSample::even(pixel, 0)));
                 cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
@@ -1082,7 +1074,8 @@ impl Visibility for Auto {
                     } else if !whole.is_nan()
                         && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                     {
-                        radiance[point.path as usize] += full * past.unasked(whole, point.firm);
+                        let more = if point.firm { past.mean() * whole } else { past.unasked(whole) };
+                        radiance[point.path as usize] += full * more;
                     }
                     continue;
                 }
@@ -1125,10 +1118,14 @@ impl Visibility for Auto {
                     });
                     questions.wholes.push(open);
                     questions.usual.push(usual);
+                    // For all samples of the pass, before any of them adds to it.
+                    let past = past_of(&mut pasts, point.pixel, share.light, map.remembered);
+                    questions.means.push(past.map_or(0.0, |past| past.mean()));
                 } else if open.is_finite()
                     && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                 {
-                    radiance[point.path as usize] += full * past.unasked(whole, point.firm);
+                    let more = if point.firm { past.mean() * whole } else { past.unasked(whole) };
+                    radiance[point.path as usize] += full * more;
                 }
             }
         }
@@ -1167,8 +1164,8 @@ impl Visibility for Auto {
         }
         let mut pasts = map.pasts_of(questions.place);
         let mut sums = Gain::<f64>::default();
-        for ((batch, &whole), &usual) in questions.batches.iter().zip(&questions.wholes).zip(&questions.usual)
-        {
+        let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.means);
+        for (batch, ((&whole, &usual), &mean)) in questions.batches.iter().zip(told) {
             let point = &questions.points[batch.point as usize];
             if whole.is_nan() {
                 continue;
@@ -1182,7 +1179,7 @@ impl Visibility for Auto {
             let v = (free / all).min(1.0);
             let bins = &questions.bins[batch.samples.start as usize..batch.samples.end as usize];
             past.mark(v, bins, estimates);
-            // Where rays are the points' own, the map goes on in any case.
+            // Where rays are the points' own, the map does not give up in any case.
             if count > 1.0 && !point.firm {
                 let radiance = stage.lights[batch.light as usize].radiance * (all / map.brightest);
                 let light = (point.diffuse * radiance).length_squared();
@@ -1192,7 +1189,12 @@ impl Visibility for Auto {
                     sums.add_quarters(light, whole, bins, estimates);
                 }
             }
-            let more = past.asked(v, off, point.firm) / all;
+            let more = if point.firm {
+                past.saw(v);
+                mean * off / all
+            } else {
+                past.asked(v, off) / all
+            };
             if more != 0.0 {
                 estimates.iter_mut().for_each(|estimate| *estimate += more);
             }

@@ -162,6 +162,8 @@ pub struct Questions {
     wholes: Vec<f32>,
     /// And for each batch how many samples it would have had without what was learned.
     usual: Vec<f32>,
+    /// And for each batch what part of its light the pixel had seen on average before the pass.
+    means: Vec<f32>,
     /// The tile's first column and row.
     place: [u32; 2],
 }
@@ -179,6 +181,7 @@ impl Questions {
         self.bins.clear();
         self.wholes.clear();
         self.usual.clear();
+        self.means.clear();
     }
 }
 
@@ -215,6 +218,13 @@ pub struct CameraSample {
     pub index: u32,
     /// Its shadow rays, over all lights together. Of `None` the usual number, which a method may share with other samples.
     pub rays: Option<u32>,
+}
+
+impl CameraSample {
+    /// One of a pixel that gets one in each pass, with the usual shadow rays.
+    pub fn even(pixel: u32, pass: u32) -> Self {
+        Self { pixel, round: 0, index: pass, rays: None }
+    }
 }
 
 /// What a thread keeps from tile to tile, so that nothing is allocated in between.
@@ -254,14 +264,9 @@ pub fn render_tile(
     film: &mut TileFilm,
     scratch: &mut Scratch,
 ) {
-    scratch.paths.clear();
-    scratch.paths.extend((0..film.tile().len() as u32).map(|pixel| CameraSample {
-        pixel,
-        round: 0,
-        index: pass,
-        rays: None,
-    }));
-    render_paths(stage, method, width, film, scratch);
+    let pixels = 0..film.tile().len() as u32;
+    let samples = pixels.map(|pixel| CameraSample::even(pixel, pass));
+    render_samples(stage, method, width, samples, film, scratch);
 }
 
 /// The same of any camera samples of a tile.
@@ -275,16 +280,6 @@ pub fn render_samples(
 ) {
     scratch.paths.clear();
     scratch.paths.extend(samples);
-    render_paths(stage, method, width, film, scratch);
-}
-
-fn render_paths(
-    stage: &Stage<'_>,
-    method: &dyn Visibility,
-    width: u32,
-    film: &mut TileFilm,
-    scratch: &mut Scratch,
-) {
     let start = clock::of_thread();
     cast(stage, film.tile(), width, scratch);
     let cast_end = clock::of_thread();
@@ -304,12 +299,7 @@ fn render_paths(
 /// What one pass over a tile asks: for benchmarks and tests of visibility alone.
 pub fn questions(stage: &Stage<'_>, tile: Tile, width: u32, pass: u32) -> Questions {
     let mut scratch = Scratch::default();
-    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample {
-        pixel,
-        round: 0,
-        index: pass,
-        rays: None,
-    }));
+    scratch.paths.extend((0..tile.len() as u32).map(|pixel| CameraSample::even(pixel, pass)));
     cast(stage, tile, width, &mut scratch);
     sample_lights(stage, &mut scratch);
     scratch.questions
@@ -412,7 +402,7 @@ fn expect(stage: &Stage<'_>, point: &ShadingPoint, shares: &mut Vec<Share>) {
     shares.clear();
     shares.extend(stage.lights.iter().enumerate().filter_map(|(light, area)| {
         let unshadowed = area.unshadowed(point.x, point.normal)?;
-        Some(Share { light: light as u32, unshadowed, expected: 0.0, boost: 1.0, count: 0, each: 0.0 })
+        Some(Share { light: light as u32, unshadowed, expected: 0.0, count: 0, each: 0.0 })
     }));
     let value = |share: &Share| share.unshadowed * stage.lights[share.light as usize].radiance.element_sum();
     let total: f32 = shares.iter().map(value).sum();
@@ -432,12 +422,11 @@ fn round(sampler: &mut Sampler, shares: &mut [Share], all: Option<u32>) {
         let until = match all {
             Some(all) if place == last => all,
             Some(all) => (due as u32).clamp(given, all),
-            None => due as u32,
+            None => (due as u32).max(given),
         };
         share.count = until - given;
         given = until;
-        let each = if share.expected > 1.001 { 1.0 / share.count as f32 } else { 1.0 / share.expected };
-        share.each = each * share.boost;
+        share.each = if share.expected > 1.001 { 1.0 / share.count as f32 } else { 1.0 / share.expected };
     }
 }
 
@@ -449,8 +438,6 @@ struct Share {
     unshadowed: f32,
     /// Samples it is due, and those it gets.
     expected: f32,
-    /// How many times more each counts than it would by their number.
-    boost: f32,
     count: u32,
     each: f32,
 }

@@ -17,7 +17,8 @@
 //!
 //! On average `T_n` is 0, since c_p and v_q are of different passes and so of different random numbers. But what a pass adds takes
 //! back from earlier ones, and is 0 on average only as long as the number of passes does not depend on these. Where it does,
-//! in adaptive renders, `u_p` is the mean over the *earlier* passes, and each `u_p c_p` is 0 on average whatever these were.
+//! in adaptive renders, `u_p` is the [mean](Past::mean) over the *earlier* passes, the same for all samples of a pass, and each
+//! `u_p c_p` is 0 on average whatever these were.
 
 /// Sums over the passes of a pixel and a light.
 #[derive(Clone, Copy, Debug, Default)]
@@ -37,16 +38,20 @@ pub(super) struct Past {
 }
 
 impl Past {
-    /// What a pass adds that saw the part `v`, with samples `c` short of the whole; `only_earlier` if other passes' parts
-    /// must be those of earlier ones.
+    /// What a pass adds that saw the part `v`, with samples `c` short of the whole.
     #[inline(always)]
-    pub(super) fn asked(&mut self, v: f32, c: f32, only_earlier: bool) -> f32 {
-        let expected = self.mean() * c;
-        self.asked += 1.0;
-        self.seen += v;
+    pub(super) fn asked(&mut self, v: f32, c: f32) -> f32 {
+        self.saw(v);
         self.off += c;
         self.both += v * c;
-        if only_earlier { expected } else { self.change() }
+        self.change()
+    }
+
+    /// Notes that a pass, or a sample of one, saw the part `v`.
+    #[inline(always)]
+    pub(super) fn saw(&mut self, v: f32) {
+        self.asked += 1.0;
+        self.seen += v;
     }
 
     /// Expects the part `v`, as if that had been seen in so much of a pass. Before any pass.
@@ -60,9 +65,9 @@ impl Past {
 
     /// What a pass adds that had no sample of the light, where all of it would send `c`.
     #[inline(always)]
-    pub(super) fn unasked(&mut self, c: f32, only_earlier: bool) -> f32 {
+    pub(super) fn unasked(&mut self, c: f32) -> f32 {
         self.unasked += c;
-        if only_earlier { self.mean() * c } else { self.change() }
+        self.change()
     }
 
     /// Notes in which bins samples were free and blocked.
@@ -265,9 +270,15 @@ mod tests {
                 let mut total = 0.0;
                 for (pass, of) in outcomes.iter().enumerate().take(passes as usize) {
                     let (seen, c) = of[case / 3usize.pow(pass as u32) % 3];
+                    let u = past.mean();
                     let more = match seen {
-                        Some(v) => past.asked(v, c, only_earlier),
-                        None => past.unasked(c, only_earlier),
+                        Some(v) if only_earlier => {
+                            past.saw(v);
+                            u * c
+                        }
+                        None if only_earlier => u * c,
+                        Some(v) => past.asked(v, c),
+                        None => past.unasked(c),
                     };
                     total += more;
                     if pass + 1 == passes as usize {
@@ -291,8 +302,8 @@ mod tests {
         let (mut lit, mut dark) = (Past::default(), Past::default());
         let (mut total, mut black) = (0.0, 0.0);
         for mean in [0.9, 1.2, 0.7, 1.05] {
-            total += mean + lit.asked(1.0, 1.0 - mean, false);
-            black += dark.asked(0.0, 1.0 - mean, false);
+            total += mean + lit.asked(1.0, 1.0 - mean);
+            black += dark.asked(0.0, 1.0 - mean);
         }
         assert!((total - 4.0f32).abs() < 1e-5 && black == 0.0, "{total} {black}");
     }
@@ -328,7 +339,7 @@ mod tests {
         let mut pasts = vec![Past::default(); 9];
         for past in &mut pasts {
             for _ in 0..2 {
-                past.asked(0.5, 0.0, false);
+                past.asked(0.5, 0.0);
                 past.mark(0.5, &(0..64).collect::<Vec<u8>>(), &[[1.0; 32], [0.0; 32]].concat());
             }
         }
