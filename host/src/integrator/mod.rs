@@ -123,7 +123,7 @@ pub struct ShadingPoint {
     pub key: u64,
     /// Shadow rays it is due, over all lights together.
     pub rays: u32,
-    /// Whether they are its own, and not to be shared with other points.
+    /// Whether they are its own, so that no other point gets any of them.
     pub firm: bool,
 }
 
@@ -216,7 +216,8 @@ pub struct CameraSample {
     pub round: u32,
     /// The sample in the round; those of a pixel are spread the better the fewer are left out.
     pub index: u32,
-    /// Its shadow rays, over all lights together. Of `None` the usual number, which a method may share with other samples.
+    /// Its shadow rays, over all lights together: a method may ask more for it, and fewer only of lights that it has proven
+    /// lit. Of `None` the usual number, which a method may share with other samples.
     pub rays: Option<u32>,
 }
 
