@@ -18,7 +18,7 @@ use occlude_kernel::occlusion_map::{
 use occlude_kernel::{Ray, Targets, TileScratch, Uncounted};
 use occlude_tests::{Random, shared_scene};
 use std::path::Path;
-use std::sync::atomic::AtomicBool;
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Rates of classes whose doubts are measured to be what they like.
 fn rates(random: &mut Random) -> Rates {
@@ -581,11 +581,11 @@ fn means(runs: &[Vec<f64>]) -> Vec<[f64; 2]> {
 /// and a half standard errors for 54 blocks of Student's t with 39 degrees of freedom or more: wrong once in 7000 runs if
 /// there is no bias.
 #[test]
-fn adaptive_pictures_are_right_on_average_and_the_same_for_any_number_of_threads() {
+fn adaptive_pictures_are_right_on_average_and_the_same_for_any_threads_and_level() {
     let setting = Setting::own("columns", (72, 48));
     let size = (setting.camera.width, setting.camera.height);
-    let image = |method: &dyn Visibility, seed: u64, passes: u32, adaptive: bool, threads: usize| {
-        setting.with_stage(8, detect(), |stage| {
+    let image = |method: &dyn Visibility, seed: u64, passes: u32, adaptive: bool, threads: usize, level| {
+        setting.with_stage(8, level, |stage| {
             let stage = Stage { seed, ..*stage };
             let (limits, stop) = (Limits { passes, time: None }, AtomicBool::new(false));
             let rendered = if adaptive {
@@ -598,14 +598,18 @@ fn adaptive_pictures_are_right_on_average_and_the_same_for_any_number_of_threads
     };
     let runs =
         |run: &dyn Fn(u64) -> Image| -> Vec<Vec<f64>> { (0..40).map(|seed| blocks(&run(seed))).collect() };
-    let reference = means(&runs(&|seed| image(&Exact, 100 + seed, 64, false, 2)));
+    let reference = means(&runs(&|seed| image(&Exact, 100 + seed, 64, false, 2, detect())));
     for (name, exact) in [("exact", true), ("auto", false)] {
         let method = || -> Box<dyn Visibility> {
             if exact { Box::new(Exact) } else { Box::new(Auto::new(AutoOptions::default())) }
         };
-        let with = |threads| image(&*method(), 3, 33, true, threads).pixels;
-        assert_eq!(with(1), with(3), "{name}: threads");
-        let found = means(&runs(&|seed| image(&*method(), seed, 32, true, 2)));
+        let with = |threads, level| image(&*method(), 3, 33, true, threads, level).pixels;
+        let first = with(1, detect());
+        assert_eq!(first, with(3, detect()), "{name}: threads");
+        for level in levels() {
+            assert_eq!(first, with(2, level), "{name}: {level:?}");
+        }
+        let found = means(&runs(&|seed| image(&*method(), seed, 32, true, 2, detect())));
         for (block, ([mean, error], [expected, its])) in found.iter().zip(&reference).enumerate() {
             let z = (mean - expected) / (error + its).sqrt().max(1e-7);
             assert!(z.abs() < 5.5, "{name}, block {block}: {mean} for {expected}, z = {z}");
@@ -616,7 +620,7 @@ fn adaptive_pictures_are_right_on_average_and_the_same_for_any_number_of_threads
 /// Small pictures of many seeds, adaptive ones of the exact method and of `auto` against plain exact ones with seeds of their
 /// own: the mean of each pixel, that of all, and the mean square of the pixels' standard scores. Five and a half standard
 /// errors each, of normal distributions: wrong once in 30 000 runs if there is no bias.
-fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, runs: u64) {
+fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, stop_after: u32, runs: u64) {
     let size = (setting.camera.width, setting.camera.height);
     let sums = |exact: bool, adaptive: bool, first: u64| -> Vec<[f64; 2]> {
         let run = |seed| {
@@ -626,7 +630,8 @@ fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, runs: 
                     if exact { Box::new(Exact) } else { Box::new(Auto::new(AutoOptions::default())) };
                 let (limits, stop) = (Limits { passes, time: None }, AtomicBool::new(false));
                 let render = if adaptive { render_adaptively } else { render };
-                let film = render(&stage, &*method, size, limits, 1, &stop, |_| ()).expect("a thread").film;
+                let until = |passes| stop.store(adaptive && passes == stop_after, Ordering::Relaxed);
+                let film = render(&stage, &*method, size, limits, 1, &stop, until).expect("a thread").film;
                 film.develop().pixels.iter().map(|p| f64::from(p[0])).collect()
             })
         };
@@ -659,11 +664,12 @@ fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, runs: 
 /// from earlier rounds 7.0 at worst, squared 2.26 for `auto`.
 #[test]
 fn rounds_know_nothing_of_each_other() {
-    adaptive_means_are_those_of_plain_ones(&Setting::own("columns", (24, 16)), 32, 1000);
+    adaptive_means_are_those_of_plain_ones(&Setting::own("columns", (24, 16)), 32, 32, 1000);
 }
 
 /// Under 36 lamps of unlike power behind slats a point asks few of them, with many samples of a pixel in a pass: what is
-/// taken out of those that ask a lamp and of those that do not has to be the same.
+/// taken out of those that ask a lamp and of those that do not has to fit. The pictures are broken off after the first pass
+/// of a round, most of which has seen little yet.
 #[test]
 fn lamps_that_are_not_asked_are_missed_by_none() {
     let mut obj = String::from("mtllib scene.mtl\nusemtl floor\n");
@@ -700,7 +706,7 @@ fn lamps_that_are_not_asked_are_missed_by_none() {
     let setting = Setting::of(&folder, &request);
     std::fs::remove_dir_all(&folder).expect("removed");
     assert_eq!(setting.lights.len(), 36);
-    adaptive_means_are_those_of_plain_ones(&setting, 16, 1000);
+    adaptive_means_are_those_of_plain_ones(&setting, 32, 5, 1000);
 }
 
 /// Of each block of 16 by 16 pixels: the mean of the reference over the channels, the mean difference, and how many standard
