@@ -606,7 +606,8 @@ fn adaptive_pictures_are_right_on_average_and_the_same_for_any_threads_and_level
         let with = |threads, level| image(&*method(), 3, 33, true, threads, level).pixels;
         let first = with(1, detect());
         assert_eq!(first, with(3, detect()), "{name}: threads");
-        for level in levels() {
+        // What `auto` proves lit may differ from level to level.
+        for level in levels().filter(|_| exact) {
             assert_eq!(first, with(2, level), "{name}: {level:?}");
         }
         let found = means(&runs(&|seed| image(&*method(), seed, 32, true, 2, detect())));
