@@ -3,7 +3,9 @@
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
 use occlude_host::film::{Film, Image, Tile};
-use occlude_host::integrator::{Auto, AutoOptions, Exact, Scratch, Stage, Visibility, render_tile};
+use occlude_host::integrator::{
+    Auto, AutoOptions, CameraSample, Exact, Scratch, Stage, Visibility, render_samples, render_tile,
+};
 use occlude_host::light::{self, AreaLight};
 use occlude_host::metrics::compare;
 use occlude_host::output::read;
@@ -527,7 +529,7 @@ fn threads_render_the_same_bits_and_levels_nearly() {
     for threads in [2, 5] {
         assert_eq!(first.pixels, image(threads, detect()).pixels, "{threads} threads");
     }
-    // What can be proven lit may differ from level to level, and with it roundings and what is learned.
+    // Levels round otherwise, and so may learn otherwise.
     for level in levels().skip(1) {
         let found = compare(&image(2, level), &first).expect("the same size");
         let mean = found.mean_reference.iter().sum::<f64>() / 3.0;
@@ -609,7 +611,6 @@ fn adaptive_pictures_are_right_on_average_and_the_same_for_any_threads_and_level
         let with = |threads, level| image(&*method(), 3, 33, true, threads, level).pixels;
         let first = with(1, detect());
         assert_eq!(first, with(3, detect()), "{name}: threads");
-        // What `auto` proves lit may differ from level to level.
         for level in levels().filter(|_| exact) {
             let other = with(2, level);
             let same = first.iter().zip(&other).filter(|(a, b)| a == b).count();
@@ -623,22 +624,27 @@ fn adaptive_pictures_are_right_on_average_and_the_same_for_any_threads_and_level
     }
 }
 
-/// Small pictures of many seeds, adaptive ones of the exact method and of `auto` against plain exact ones with seeds of their
-/// own: the mean of each pixel, that of all, and the mean square of the pixels' standard scores. Five and a half standard
-/// errors each, of normal distributions: wrong once in 30 000 runs if there is no bias.
-fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, stop_after: u32, runs: u64) {
+/// Small pictures of many seeds, of the exact method and of `auto`, against plain exact ones with seeds of their own: the mean
+/// of each pixel, that of all, and the mean square of the pixels' standard scores. Five and a half standard errors each, of
+/// normal distributions: wrong once in 30 000 runs if there is no bias.
+fn means_are_those_of_plain_pictures(
+    setting: &Setting,
+    passes: u32,
+    runs: u64,
+    picture: impl Fn(&Stage<'_>, &dyn Visibility) -> Film + Sync,
+) {
     let size = (setting.camera.width, setting.camera.height);
-    let sums = |exact: bool, adaptive: bool, first: u64| -> Vec<[f64; 2]> {
-        let run = |seed| {
+    let plain = |stage: &Stage<'_>, method: &dyn Visibility| {
+        let (limits, stop) = (Limits { passes, time: None }, AtomicBool::new(false));
+        render(stage, method, size, limits, 1, &stop, |_| ()).expect("a thread").film
+    };
+    let sums = |exact: bool, first: u64, film: &(dyn Fn(&Stage<'_>, &dyn Visibility) -> Film + Sync)| {
+        let run = |seed| -> Vec<f64> {
             setting.with_stage(4, detect(), |stage| {
                 let stage = Stage { seed, ..*stage };
                 let method: Box<dyn Visibility> =
                     if exact { Box::new(Exact) } else { Box::new(Auto::new(AutoOptions::default())) };
-                let (limits, stop) = (Limits { passes, time: None }, AtomicBool::new(false));
-                let render = if adaptive { render_adaptively } else { render };
-                let until = |passes| stop.store(adaptive && passes == stop_after, Ordering::Relaxed);
-                let film = render(&stage, &*method, size, limits, 1, &stop, until).expect("a thread").film;
-                film.develop().pixels.iter().map(|p| f64::from(p[0])).collect()
+                film(&stage, &*method).develop().pixels.iter().map(|p| f64::from(p[0])).collect()
             })
         };
         let halves = [first..first + runs / 2, first + runs / 2..first + runs];
@@ -648,20 +654,27 @@ fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, stop_a
         });
         means(&of_seeds)
     };
-    let plain = sums(true, false, 0);
+    let expected = sums(true, 0, &plain);
     for exact in [true, false] {
-        let found = sums(exact, true, 10_000);
+        let found = sums(exact, 10_000, &picture);
         let z = |a: [f64; 2], b: [f64; 2]| (a[0] - b[0]) / (a[1] + b[1]).sqrt().max(1e-9);
-        let scores: Vec<f64> = found.iter().zip(&plain).map(|(a, b)| z(*a, *b)).collect();
+        let scores: Vec<f64> = found.iter().zip(&expected).map(|(a, b)| z(*a, *b)).collect();
         let worst = scores.iter().map(|z| z.abs()).fold(0.0, f64::max);
         let n = scores.len() as f64;
         let square = scores.iter().map(|z| z * z).sum::<f64>() / n;
         let whole = |of: &[[f64; 2]]| of.iter().fold([0.0; 2], |sum, one| [sum[0] + one[0], sum[1] + one[1]]);
-        let (a, b) = (whole(&found), whole(&plain));
-        let what = format!("exact {exact}: z = {:.2}, {worst:.2} at worst, squared {square:.3}", z(a, b));
+        let z = z(whole(&found), whole(&expected));
+        let what = format!("exact {exact}: z = {z:.2}, {worst:.2} at worst, squared {square:.3}");
         println!("{what}");
-        assert!(z(a, b).abs() < 5.5 && worst < 5.5 && square < 1.0 + 5.5 * (2.0 / n).sqrt(), "{what}");
+        assert!(z.abs() < 5.5 && worst < 5.5 && square < 1.0 + 5.5 * (2.0 / n).sqrt(), "{what}");
     }
+}
+
+/// An adaptive picture of 32 passes, in three rounds, or broken off after so many.
+fn adaptive_picture(stage: &Stage<'_>, method: &dyn Visibility, size: (u32, u32), passes: u32) -> Film {
+    let (limits, stop) = (Limits { passes: 32, time: None }, AtomicBool::new(false));
+    let until = |done| stop.store(done == passes, Ordering::Relaxed);
+    render_adaptively(stage, method, size, limits, 1, &stop, until).expect("a thread").film
 }
 
 /// What a pixel gets in a round follows from what it saw before, so a round must know nothing of earlier ones: neither where
@@ -670,14 +683,27 @@ fn adaptive_means_are_those_of_plain_ones(setting: &Setting, passes: u32, stop_a
 /// from earlier rounds 7.0 at worst, squared 2.26 for `auto`.
 #[test]
 fn rounds_know_nothing_of_each_other() {
-    adaptive_means_are_those_of_plain_ones(&Setting::own("columns", (24, 16)), 32, 32, 1000);
+    let setting = Setting::own("columns", (24, 16));
+    means_are_those_of_plain_pictures(&setting, 32, 1000, |stage, method| {
+        adaptive_picture(stage, method, (24, 16), 32)
+    });
 }
 
-/// Under 36 lamps of unlike power behind slats a point asks few of them, with many samples of a pixel in a pass: what is
-/// taken out of those that ask a lamp and of those that do not has to fit. The pictures are broken off after the first pass
-/// of a round, most of which has seen little yet.
+/// After the first passes, within a round and after the first pass of the next.
 #[test]
-fn lamps_that_are_not_asked_are_missed_by_none() {
+fn adaptive_pictures_that_are_broken_off_are_right_on_average() {
+    let setting = Setting::own("columns", (24, 16));
+    for passes in [3, 6, 9] {
+        means_are_those_of_plain_pictures(&setting, 8, 400, |stage, method| {
+            adaptive_picture(stage, method, (24, 16), passes)
+        });
+    }
+}
+
+/// Of 36 lamps of unlike power behind slats a point asks few. With many samples of a pixel in one pass, the first of all,
+/// what is taken out of those that ask a lamp has to fit what those have that do not.
+#[test]
+fn lights_that_get_no_sample_are_accounted_for() {
     let mut obj = String::from("mtllib scene.mtl\nusemtl floor\n");
     let mut quads = 0;
     let mut quad = |obj: &mut String, [x, z]: [f32; 2], [w, d]: [f32; 2], y: f32| {
@@ -712,7 +738,19 @@ fn lamps_that_are_not_asked_are_missed_by_none() {
     let setting = Setting::of(&folder, &request);
     std::fs::remove_dir_all(&folder).expect("removed");
     assert_eq!(setting.lights.len(), 36);
-    adaptive_means_are_those_of_plain_ones(&setting, 32, 5, 1000);
+    means_are_those_of_plain_pictures(&setting, 32, 300, |stage, method| {
+        let mut film = Film::new(16, 10);
+        let tiles: Vec<Tile> = film.tiles().iter().map(|tile| tile.tile()).collect();
+        method.begin(stage, &tiles, 16);
+        let mut scratch = Scratch::default();
+        for tile in film.tiles_mut() {
+            let samples = (0..tile.tile().len() as u32).flat_map(|pixel| {
+                (0..32).map(move |index| CameraSample { pixel, round: 1, index, rays: Some(4) })
+            });
+            render_samples(stage, method, 16, samples, tile, &mut scratch);
+        }
+        film
+    });
 }
 
 /// Of each block of 16 by 16 pixels: the mean of the reference over the channels, the mean difference, and how many standard

@@ -49,7 +49,8 @@ const CAMERA: f32 = 10.0;
 const MOST: [u32; 2] = [16, 256];
 const MOST_RAYS: u32 = 16_384;
 
-/// More samples than this are rounded to a power of two, which leaves 0.87 of the squared error.
+/// More samples than this are rounded to a power of two, which for the same work leaves 0.89 of the squared error at 64
+/// passes and 0.78 at 32 (six scenes).
 const AS_THEY_ARE: f32 = 6.0;
 
 /// Numbers, or powers of two, are rounded up half this sooner or later, from pixel to pixel, so that work is shared out to

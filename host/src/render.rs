@@ -80,7 +80,7 @@ pub fn render_adaptively(
 /// How many passes the round after so many has, of so many in all.
 ///
 /// Samples of one round are spread over the pixel, those of two know nothing of each other: few rounds, the last of them
-/// large, have up to half the squared error of rounds that double.
+/// large, leave about 0.8 of the squared error of rounds that double (ten scenes, 16 to 64 passes).
 fn round_after(passes: u32, all: u32) -> u32 {
     let mut end = all;
     while end / 4 >= (2 * FIRST).max(passes + 1) {
@@ -89,7 +89,7 @@ fn round_after(passes: u32, all: u32) -> u32 {
     end - passes
 }
 
-/// What a round of so many passes counts: well spread samples have a variance of about this power of their number.
+/// What a round of so many passes counts: one over the variance that so many well spread samples have, about.
 fn weight_of_round(passes: u32) -> f64 {
     f64::from(passes).powf(1.5)
 }
@@ -166,8 +166,8 @@ fn run(
                 let mut scratch = own.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
                 let Some((due, pass, count)) = plan else {
                     let pixels = 0..tile.tile().len() as u32;
-                    let samples =
-                        pixels.map(|pixel| CameraSample { pixel, round: 0, index: passes, rays: even_rays });
+                    let samples = pixels
+                        .map(|pixel| CameraSample { rays: even_rays, ..CameraSample::even(pixel, passes) });
                     render_samples(stage, method, size.0, samples, tile, &mut scratch);
                     return;
                 };

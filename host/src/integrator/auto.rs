@@ -1075,8 +1075,7 @@ impl Visibility for Auto {
                     } else if !whole.is_nan()
                         && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                     {
-                        let more = if point.firm { past.mean() * whole } else { past.unasked(whole) };
-                        radiance[point.path as usize] += full * more;
+                        radiance[point.path as usize] += full * past.unasked(whole, point.firm);
                     }
                     continue;
                 }
@@ -1120,13 +1119,14 @@ impl Visibility for Auto {
                     questions.wholes.push(open);
                     questions.usual.push(usual);
                     // For all samples of the pass, before any of them adds to it.
-                    let past = past_of(&mut pasts, point.pixel, share.light, map.remembered);
-                    questions.means.push(past.map_or(0.0, |past| past.mean()));
+                    questions.before.push(point.firm.then(|| {
+                        let past = past_of(&mut pasts, point.pixel, share.light, map.remembered);
+                        past.map_or(0.0, |past| past.mean())
+                    }));
                 } else if open.is_finite()
                     && let Some(past) = past_of(&mut pasts, point.pixel, share.light, map.remembered)
                 {
-                    let more = if point.firm { past.mean() * whole } else { past.unasked(whole) };
-                    radiance[point.path as usize] += full * more;
+                    radiance[point.path as usize] += full * past.unasked(whole, point.firm);
                 }
             }
         }
@@ -1165,8 +1165,8 @@ impl Visibility for Auto {
         }
         let mut pasts = map.pasts_of(questions.place);
         let mut sums = Gain::<f64>::default();
-        let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.means);
-        for (batch, ((&whole, &usual), &mean)) in questions.batches.iter().zip(told) {
+        let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.before);
+        for (batch, ((&whole, &usual), &before)) in questions.batches.iter().zip(told) {
             let point = &questions.points[batch.point as usize];
             if whole.is_nan() {
                 continue;
@@ -1190,12 +1190,7 @@ impl Visibility for Auto {
                     sums.add_quarters(light, whole, bins, estimates);
                 }
             }
-            let more = if point.firm {
-                past.saw(v);
-                mean * off / all
-            } else {
-                past.asked(v, off) / all
-            };
+            let more = past.asked(v, off, before) / all;
             if more != 0.0 {
                 estimates.iter_mut().for_each(|estimate| *estimate += more);
             }

@@ -162,8 +162,8 @@ pub struct Questions {
     wholes: Vec<f32>,
     /// And for each batch how many samples it would have had without what was learned.
     usual: Vec<f32>,
-    /// And for each batch what part of its light the pixel had seen on average before the pass.
-    means: Vec<f32>,
+    /// And for each batch of a point with rays of its own what part of the light its pixel had seen on average before.
+    before: Vec<Option<f32>>,
     /// The tile's first column and row.
     place: [u32; 2],
 }
@@ -181,7 +181,7 @@ impl Questions {
         self.bins.clear();
         self.wholes.clear();
         self.usual.clear();
-        self.means.clear();
+        self.before.clear();
     }
 }
 

@@ -38,20 +38,18 @@ pub(super) struct Past {
 }
 
 impl Past {
-    /// What a pass adds that saw the part `v`, with samples `c` short of the whole.
+    /// What a pass adds that saw the part `v`, with samples `c` short of the whole; or a sample of a pass before which the
+    /// mean was `before`, if it must follow from earlier ones only.
     #[inline(always)]
-    pub(super) fn asked(&mut self, v: f32, c: f32) -> f32 {
-        self.saw(v);
+    pub(super) fn asked(&mut self, v: f32, c: f32, before: Option<f32>) -> f32 {
+        self.asked += 1.0;
+        self.seen += v;
+        if let Some(mean) = before {
+            return mean * c;
+        }
         self.off += c;
         self.both += v * c;
         self.change()
-    }
-
-    /// Notes that a pass, or a sample of one, saw the part `v`.
-    #[inline(always)]
-    pub(super) fn saw(&mut self, v: f32) {
-        self.asked += 1.0;
-        self.seen += v;
     }
 
     /// Expects the part `v`, as if that had been seen in so much of a pass. Before any pass.
@@ -63,9 +61,13 @@ impl Past {
         self.seen_in[1] |= u64::from(v < 1.0);
     }
 
-    /// What a pass adds that had no sample of the light, where all of it would send `c`.
+    /// What a pass adds that had no sample of the light, where all of it would send `c`; or a sample of the pass at hand, if
+    /// it must follow from earlier ones only.
     #[inline(always)]
-    pub(super) fn unasked(&mut self, c: f32) -> f32 {
+    pub(super) fn unasked(&mut self, c: f32, only_earlier: bool) -> f32 {
+        if only_earlier {
+            return self.mean() * c;
+        }
         self.unasked += c;
         self.change()
     }
@@ -270,15 +272,10 @@ mod tests {
                 let mut total = 0.0;
                 for (pass, of) in outcomes.iter().enumerate().take(passes as usize) {
                     let (seen, c) = of[case / 3usize.pow(pass as u32) % 3];
-                    let u = past.mean();
+                    let before = only_earlier.then(|| past.mean());
                     let more = match seen {
-                        Some(v) if only_earlier => {
-                            past.saw(v);
-                            u * c
-                        }
-                        None if only_earlier => u * c,
-                        Some(v) => past.asked(v, c),
-                        None => past.unasked(c),
+                        Some(v) => past.asked(v, c, before),
+                        None => past.unasked(c, only_earlier),
                     };
                     total += more;
                     if pass + 1 == passes as usize {
@@ -302,8 +299,8 @@ mod tests {
         let (mut lit, mut dark) = (Past::default(), Past::default());
         let (mut total, mut black) = (0.0, 0.0);
         for mean in [0.9, 1.2, 0.7, 1.05] {
-            total += mean + lit.asked(1.0, 1.0 - mean);
-            black += dark.asked(0.0, 1.0 - mean);
+            total += mean + lit.asked(1.0, 1.0 - mean, None);
+            black += dark.asked(0.0, 1.0 - mean, None);
         }
         assert!((total - 4.0f32).abs() < 1e-5 && black == 0.0, "{total} {black}");
     }
@@ -339,7 +336,7 @@ mod tests {
         let mut pasts = vec![Past::default(); 9];
         for past in &mut pasts {
             for _ in 0..2 {
-                past.asked(0.5, 0.0);
+                past.asked(0.5, 0.0, None);
                 past.mark(0.5, &(0..64).collect::<Vec<u8>>(), &[[1.0; 32], [0.0; 32]].concat());
             }
         }
