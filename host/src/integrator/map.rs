@@ -23,7 +23,6 @@ use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::photons::{Class, Nearest, Photons, Place};
 use occlude_kernel::{
     BatchScratch, Bvh, Child, Counter, Counts, Native, Node, Occluders, Simd, Targets, TriangleBlock,
-    Uncounted,
 };
 use std::f32::consts::FRAC_1_PI;
 use std::sync::atomic::{AtomicU64, Ordering};
@@ -200,27 +199,25 @@ impl Visibility for Map<'_> {
         counts: &mut Counts,
     ) {
         estimates.clear();
-        let classes = if stage.count {
-            dispatch(stage.level, Ask { map: self, stage, questions, estimates, counter: counts })
-        } else {
-            dispatch(stage.level, Ask { map: self, stage, questions, estimates, counter: &mut Uncounted })
-        };
+        let mut unwanted = Counts::default();
+        let counts = if stage.count { counts } else { &mut unwanted };
+        let classes = dispatch(stage.level, Ask { map: self, stage, questions, estimates, counter: counts });
         for (total, of_tile) in self.classes.0.iter().zip(classes) {
             total.fetch_add(of_tile, Ordering::Relaxed);
         }
     }
 }
 
-/// All batches of a tile.
-struct Ask<'a, C> {
+/// All batches of a tile. Counts in any case: not to would be one more copy to compile.
+struct Ask<'a> {
     map: &'a Map<'a>,
     stage: &'a Stage<'a>,
     questions: &'a Questions,
     estimates: &'a mut Vec<f32>,
-    counter: &'a mut C,
+    counter: &'a mut Counts,
 }
 
-impl<C: Counter> Task for Ask<'_, C> {
+impl Task for Ask<'_> {
     type Output = [u64; 4];
 
     #[inline(always)]
@@ -287,9 +284,7 @@ impl<C: Counter> Task for Ask<'_, C> {
                     continue;
                 }
                 match list {
-                    None => {
-                        bvh.occluded_batch(point.origin, &targets, None, counter, &mut tracer.scratch, words)
-                    }
+                    None => tracer.trace_scene((simd, bvh), point.origin, &targets, counter, words),
                     Some(list) => {
                         let blockers = (&prepared.blockers, &map.objects[..]);
                         let x = point.origin.to_array();
@@ -383,7 +378,7 @@ impl Tracer {
         list: &[u32],
         x: [f32; 3],
         targets: &Targets<'_>,
-        counter: &mut impl Counter,
+        counter: &mut Counts,
         blocked: &mut [u64],
     ) {
         if !self.ways.alone {
@@ -403,6 +398,7 @@ impl Tracer {
         }
     }
 
+    /// In a function of its own, so that it is compiled once.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn trace_all<S: Simd>(
@@ -412,52 +408,69 @@ impl Tracer {
         list: &[u32],
         x: [f32; 3],
         targets: &Targets<'_>,
-        counter: &mut impl Counter,
+        counter: &mut Counts,
         blocked: &mut [u64],
     ) {
-        let (roots, scratch) = (&self.roots, &mut self.scratch);
-        let (tree, roots) = match blockers {
-            BlockerSet::Triangles => {
-                if let Some((nodes, blocks)) = self.grown {
-                    let tree = bvh.with_small(&self.nodes[..nodes], &self.blocks[..blocks]);
-                    let tree = tree.expect("the builder keeps the kernel's rules");
-                    tree.occluded_batch(x, targets, None, counter, scratch, blocked);
-                    return;
-                }
-                (bvh.with_blocks(&self.blocks), &roots[..])
-            }
-            BlockerSet::Treelets(..) => (bvh, &roots[..]),
-            BlockerSet::Objects(..) => {
-                // Trees of their own, each asked about what the others leave.
-                blocked.fill(0);
-                let mut by_one = [0u64; MOST / 64];
-                counter.rays(targets.len() as u32);
-                let mut tests = Tests(counter);
-                for &object in list {
-                    let tree = objects[object as usize].on(simd);
-                    tree.occluded_batch(x, targets, None, &mut tests, scratch, &mut by_one);
-                    for (word, more) in blocked.iter_mut().zip(by_one) {
-                        *word |= more;
+        simd.apart(
+            #[inline(always)]
+            || {
+                let (tree, roots) = match blockers {
+                    BlockerSet::Triangles => {
+                        if let Some((nodes, blocks)) = self.grown {
+                            let tree = bvh.with_small(&self.nodes[..nodes], &self.blocks[..blocks]);
+                            let tree = tree.expect("the builder keeps the kernel's rules");
+                            return trace_tree((simd, tree), x, targets, counter, &mut self.scratch, blocked);
+                        }
+                        (bvh.with_blocks(&self.blocks), &self.roots[..])
                     }
-                }
-                return;
-            }
-        };
-        tree.occluded_batch_by(roots, x, targets, None, counter, scratch, blocked);
+                    BlockerSet::Treelets(..) => (bvh, &self.roots[..]),
+                    BlockerSet::Objects(..) => {
+                        // Trees of their own, each asked about what the others leave; rays count once.
+                        blocked.fill(0);
+                        let mut by_one = [0u64; MOST / 64];
+                        let rays = counter.rays + targets.len() as u64;
+                        for &object in list {
+                            let tree = (simd, objects[object as usize].on(simd));
+                            trace_tree(tree, x, targets, counter, &mut self.scratch, &mut by_one);
+                            for (word, more) in blocked.iter_mut().zip(by_one) {
+                                *word |= more;
+                            }
+                        }
+                        counter.rays = rays;
+                        return;
+                    }
+                };
+                tree.occluded_batch_by(roots, x, targets, None, counter, &mut self.scratch, blocked);
+            },
+        );
+    }
+
+    /// Asks the scene.
+    #[inline(always)]
+    fn trace_scene<S: Simd>(
+        &mut self,
+        (simd, bvh): (S, Bvh<'_, S>),
+        x: impl Into<[f32; 3]>,
+        targets: &Targets<'_>,
+        counter: &mut Counts,
+        blocked: &mut [u64],
+    ) {
+        trace_tree((simd, bvh), x.into(), targets, counter, &mut self.scratch, blocked);
     }
 }
 
-/// Counts tests but not rays, where the same rays are asked more than once.
-struct Tests<'a, C>(&'a mut C);
-
-impl<C: Counter> Counter for Tests<'_, C> {
-    #[inline(always)]
-    fn triangle_tests(&mut self, pairs: u32) {
-        self.0.triangle_tests(pairs);
-    }
-
-    #[inline(always)]
-    fn node_tests(&mut self, pairs: u32) {
-        self.0.node_tests(pairs);
-    }
+/// Asks a tree, in a function of its own as well.
+#[inline(always)]
+fn trace_tree<S: Simd>(
+    (simd, tree): (S, Bvh<'_, S>),
+    x: [f32; 3],
+    targets: &Targets<'_>,
+    counter: &mut Counts,
+    scratch: &mut BatchScratch,
+    blocked: &mut [u64],
+) {
+    simd.apart(
+        #[inline(always)]
+        || tree.occluded_batch(x, targets, None, counter, scratch, blocked),
+    );
 }

@@ -10,7 +10,7 @@
 use super::super::stochastic::{TEST_RAYS, learned};
 use super::super::{Batch, Questions, ShadingPoint, Split, Stage, Visibility};
 use super::cells::Cells;
-use super::{MOST, Map, PreparedMap, ROOM, Tests, Tracer, lit};
+use super::{MOST, Map, PreparedMap, ROOM, Tracer, lit};
 use crate::error::{Error, Result};
 use crate::integrator::{Rule, Settings};
 use crate::light::AreaLight;
@@ -19,9 +19,7 @@ use crate::sampler::Sampler;
 use glam::Vec3;
 use occlude_kernel::lanes::{Task, dispatch};
 use occlude_kernel::photons::{Class, Nearest, PhotonId};
-use occlude_kernel::{
-    Bvh, Counter, Counts, OneTerm, Probabilities, Quotas, Simd, Tally, Targets, Uncounted, offset,
-};
+use occlude_kernel::{Bvh, Counter, Counts, OneTerm, Probabilities, Quotas, Simd, Tally, Targets, offset};
 use std::sync::atomic::Ordering;
 
 /// Asks random terms of what photons name.
@@ -106,27 +104,26 @@ impl Visibility for MapTerms<'_> {
         counts: &mut Counts,
     ) {
         estimates.clear();
-        let classes = if stage.count {
-            dispatch(stage.level, Ask { method: self, stage, questions, estimates, counter: counts })
-        } else {
-            dispatch(stage.level, Ask { method: self, stage, questions, estimates, counter: &mut Uncounted })
-        };
+        let mut unwanted = Counts::default();
+        let counts = if stage.count { counts } else { &mut unwanted };
+        let classes =
+            dispatch(stage.level, Ask { method: self, stage, questions, estimates, counter: counts });
         for (total, of_tile) in self.map.classes.0.iter().zip(classes) {
             total.fetch_add(of_tile, Ordering::Relaxed);
         }
     }
 }
 
-/// All batches of a tile.
-struct Ask<'a, C> {
+/// All batches of a tile. Counts in any case, as [`Map`] does.
+struct Ask<'a> {
     method: &'a MapTerms<'a>,
     stage: &'a Stage<'a>,
     questions: &'a Questions,
     estimates: &'a mut Vec<f32>,
-    counter: &'a mut C,
+    counter: &'a mut Counts,
 }
 
-impl<C: Counter> Task for Ask<'_, C> {
+impl Task for Ask<'_> {
     type Output = [u64; 4];
 
     /// Everything but the queries is bookkeeping, and stands in [`Work`].
@@ -274,8 +271,7 @@ impl<C: Counter> Task for Ask<'_, C> {
                     };
                     let targets = targets.on_parallelogram(light.corner, light.u, light.v);
                     let words = &mut blocked[..part.len().div_ceil(64)];
-                    let scratch = &mut tracers[0].scratch;
-                    bvh.occluded_batch(point.origin, &targets, None, counter, scratch, words);
+                    tracers[0].trace_scene((simd, bvh), point.origin, &targets, counter, words);
                     for i in 0..part.len() {
                         estimates.push(if blocked[i / 64] >> (i % 64) & 1 == 0 { 1.0 } else { 0.0 });
                     }
@@ -314,7 +310,7 @@ fn ask<S: Simd>(
     (point, group): (&ShadingPoint, usize),
     tracer: &mut Tracer,
     blocked: &mut [u64; MOST / 64],
-    counter: &mut impl Counter,
+    counter: &mut Counts,
 ) {
     let part = work.part(group);
     if part.is_empty() {
@@ -333,9 +329,11 @@ fn ask<S: Simd>(
         let targets = targets.on_parallelogram(light.corner, light.u, light.v);
         let words = &mut blocked[..some.len().div_ceil(64)];
         let blockers = (&method.map.prepared.blockers, &method.map.objects[..]);
-        let mut tests = Tests(&mut *counter);
         let names = &work.names[part.clone()];
-        tracer.trace(blockers, (simd, bvh), names, x, &targets, &mut tests, words);
+        // Both halves are asked about the same rays, which the caller counts.
+        let rays = counter.rays;
+        tracer.trace(blockers, (simd, bvh), names, x, &targets, counter, words);
+        counter.rays = rays;
         for (i, &place) in work.places[some].iter().enumerate() {
             work.visible[place as usize][group] = blocked[i / 64] >> (i % 64) & 1 == 0;
         }
