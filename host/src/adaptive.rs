@@ -63,8 +63,13 @@ const FLOOR: f32 = 0.2;
 /// The same of what rays add: there is less to be found, and more rays where nothing is are dear.
 const NOISE_FLOOR: f32 = 0.05;
 
-/// As many samples of a pixel say as much about it as those around it do.
-const TRUST: f32 = 8.0;
+/// As many samples of a pixel say as much about its edges as those around it do, up to so many pixels away.
+const EDGE_TRUST: [usize; 2] = [8, 1];
+
+/// The same about what rays add. The far end of a penumbra sends little light, but few rays see any of it, and where none did
+/// those around must tell, or some dots are left in the dark. With 16 samples of six shared scenes the relative squared error
+/// is 0.45 of that with [`EDGE_TRUST`], the RMSE 0.97 and FLIP 0.96.
+const NOISE_TRUST: [usize; 2] = [32, 3];
 
 /// Turns until samples and rays fit each other.
 const TURNS: u32 = 4;
@@ -222,17 +227,19 @@ impl Needs {
             .with_min_len(width.max(1))
             .map(|at| {
                 let (x, y) = (at % width, at / width);
-                let (rows, columns) =
-                    (y.saturating_sub(1)..(y + 2).min(height), x.saturating_sub(1)..(x + 2).min(width));
-                let each = 1.0 / (rows.len() * columns.len()) as f32;
-                let (mut edge, mut noise) = (0.0, 0.0);
-                for near in rows.flat_map(|y| &own[y * width..][columns.clone()]) {
-                    edge += each * near.edge;
-                    noise += each * near.noise;
-                }
-                let trust = self.seen[at].samples / (self.seen[at].samples + TRUST);
-                let mix = |own: f32, around: f32| trust * own + (1.0 - trust) * around;
-                Model { edge: mix(own[at].edge, edge), noise: mix(own[at].noise, noise), ..own[at] }
+                let around = |reach: usize, of: fn(&Model) -> f32| {
+                    let rows = y.saturating_sub(reach)..(y + reach + 1).min(height);
+                    let columns = x.saturating_sub(reach)..(x + reach + 1).min(width);
+                    let count = rows.len() * columns.len();
+                    rows.flat_map(|y| &own[y * width..][columns.clone()]).map(of).sum::<f32>() / count as f32
+                };
+                let samples = self.seen[at].samples;
+                let mix = |[trust, reach]: [usize; 2], of: fn(&Model) -> f32| {
+                    let own_part = samples / (samples + trust as f32);
+                    own_part * of(&own[at]) + (1.0 - own_part) * around(reach, of)
+                };
+                let (edge, noise) = (mix(EDGE_TRUST, |near| near.edge), mix(NOISE_TRUST, |near| near.noise));
+                Model { edge, noise, ..own[at] }
             })
             .collect();
         self.dim(&mut models);
