@@ -12,6 +12,8 @@ use occlude_host::sampler::Pattern;
 use occlude_host::scene::{Camera, CameraRequest, Material, Scene, load};
 use occlude_kernel::lanes::{detect, levels};
 use occlude_kernel::polygon;
+use rand_xoshiro::Xoshiro128PlusPlus;
+use rand_xoshiro::rand_core::{Rng, SeedableRng};
 use std::f64::consts::PI;
 use std::path::Path;
 use std::sync::atomic::AtomicBool;
@@ -228,6 +230,36 @@ fn a_rectangle_above_a_plane_gives_lambert() {
             assert!(chi2 < 1.5, "light of {size} at {height}, {pattern:?}: chi2 {chi2}");
         }
     }
+}
+
+/// Triangles and parallelograms above the horizon, from near and large to far and small, against double precision.
+#[test]
+fn polygons_are_off_by_some_units_of_what_is_added_up() {
+    let mut random = Xoshiro128PlusPlus::seed_from_u64(5);
+    let mut next = || (random.next_u32() >> 8) as f32 / (1 << 24) as f32;
+    let mut worst = 0.0f64;
+    for turn in 0..20_000 {
+        let size = (-12.0 * next()).exp2();
+        let mut vector = || Vec3::new(next() - 0.5, next() - 0.5, next() - 0.5) * size;
+        let (u, v, aside) = (vector(), vector(), vector());
+        let corner = aside + Vec3::Z * (1.5 * size + 1e-3 + next());
+        let all = [corner, corner + u, corner + u + v, corner + v];
+        let corners = &all[..3 + turn % 2];
+        // The sum, and what it is made of: a small light far away is what long edges leave of each other.
+        let (mut sum, mut angles) = (0.0, 0.0);
+        for (i, a) in corners.iter().enumerate() {
+            let (a, b) = (a.as_dvec3(), corners[(i + 1) % corners.len()].as_dvec3());
+            let across = a.cross(b);
+            let angle = across.length().atan2(a.dot(b));
+            sum += angle * across.z / across.length();
+            angles += angle;
+        }
+        let vertices: Vec<[f32; 3]> = corners.iter().map(Vec3::to_array).collect();
+        let e = f64::from(polygon::irradiance([0.0; 3], [0.0, 0.0, 1.0], &vertices));
+        worst = worst.max((e - 0.5 * f64::abs(sum)).abs() / angles);
+    }
+    let units = worst / f64::from(f32::EPSILON);
+    assert!(units < 1.0, "off by {units} units");
 }
 
 /// Any thread count and any SIMD level: the same bits.

@@ -381,6 +381,20 @@ mod tests {
     }
 
     #[test]
+    fn what_rays_add_is_looked_for_three_pixels_away_and_edges_one() {
+        let due = |edge: f32, noise: f32| {
+            let mut pixels = vec![seen(0.0, 0.0); 64];
+            pixels[8] = seen(edge, noise);
+            let tiles = [Tile { x: 0, y: 0, width: 64, height: 1 }];
+            needs(&pixels).share(&tiles, 16, 16, true).remove(0)
+        };
+        let work = |due: &Due| due.samples * (CAMERA as u32 + due.rays);
+        let (edges, noise) = (due(10.0, 0.0), due(0.0, 10.0));
+        assert!(work(&noise[11]) > 2 * work(&noise[12]), "{:?} {:?}", noise[11], noise[12]);
+        assert!(work(&edges[9]) > 2 * work(&edges[10]), "{:?} {:?}", edges[9], edges[10]);
+    }
+
+    #[test]
     fn where_all_is_alike_all_get_about_the_same_and_black_is_no_trouble() {
         for pixel in [seen(0.0, 0.0), seen(1.0, 1.0), Seen::default()] {
             let tiles = [Tile { x: 0, y: 0, width: 5, height: 1 }];
