@@ -19,7 +19,7 @@ const MOST: usize = 5;
 /// - `vertices`: three or four, in order around the polygon. The side that faces `x` counts as the bright one;
 ///   the caller knows which side emits. More than four vertices: only the first four are used.
 /// - From 0 to π. For a diffuse surface of reflectance `k` the radiance is `k E / π`.
-/// - Cost: four arc tangents side by side, 70 ns; twice that where the horizon cuts it.
+/// - Cost: four arc tangents side by side, 70 ns on a Zen 1; 180 ns where the horizon cuts it.
 ///
 /// Lambert, "Photometria" (1760); the clipping as in Baum, Rushmeier and Winget, "Improving Radiosity Solutions
 /// Through the Use of Analytically Determined Form-Factors" (SIGGRAPH 1989).

@@ -284,7 +284,10 @@ impl Task for Ask<'_> {
                     continue;
                 }
                 match list {
-                    None => tracer.trace_scene((simd, bvh), point.origin, &targets, counter, words),
+                    None => {
+                        let (x, scratch) = (point.origin.to_array(), &mut tracer.scratch);
+                        trace_tree((simd, bvh), x, &targets, counter, scratch, words);
+                    }
                     Some(list) => {
                         let blockers = (&prepared.blockers, &map.objects[..]);
                         let x = point.origin.to_array();
@@ -443,19 +446,6 @@ impl Tracer {
                 tree.occluded_batch_by(roots, x, targets, None, counter, &mut self.scratch, blocked);
             },
         );
-    }
-
-    /// Asks the scene.
-    #[inline(always)]
-    fn trace_scene<S: Simd>(
-        &mut self,
-        (simd, bvh): (S, Bvh<'_, S>),
-        x: impl Into<[f32; 3]>,
-        targets: &Targets<'_>,
-        counter: &mut Counts,
-        blocked: &mut [u64],
-    ) {
-        trace_tree((simd, bvh), x.into(), targets, counter, &mut self.scratch, blocked);
     }
 }
 

@@ -10,7 +10,7 @@
 use super::super::stochastic::{TEST_RAYS, learned};
 use super::super::{Batch, Questions, ShadingPoint, Split, Stage, Visibility};
 use super::cells::Cells;
-use super::{MOST, Map, PreparedMap, ROOM, Tracer, lit};
+use super::{MOST, Map, PreparedMap, ROOM, Tracer, lit, trace_tree};
 use crate::error::{Error, Result};
 use crate::integrator::{Rule, Settings};
 use crate::light::AreaLight;
@@ -271,7 +271,8 @@ impl Task for Ask<'_> {
                     };
                     let targets = targets.on_parallelogram(light.corner, light.u, light.v);
                     let words = &mut blocked[..part.len().div_ceil(64)];
-                    tracers[0].trace_scene((simd, bvh), point.origin, &targets, counter, words);
+                    let (x, scratch) = (point.origin.to_array(), &mut tracers[0].scratch);
+                    trace_tree((simd, bvh), x, &targets, counter, scratch, words);
                     for i in 0..part.len() {
                         estimates.push(if blocked[i / 64] >> (i % 64) & 1 == 0 { 1.0 } else { 0.0 });
                     }
