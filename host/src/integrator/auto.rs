@@ -18,6 +18,7 @@
 //! for points whose rays are their own.
 
 mod draws;
+mod kinds;
 mod past;
 mod prove;
 mod saved;
@@ -26,6 +27,8 @@ mod seed;
 pub use saved::{SavedMap, fingerprint};
 
 use self::draws::{Bins, Draws};
+pub(super) use self::kinds::Kind;
+use self::kinds::Variances;
 use self::past::{Nearby, Past};
 use self::prove::Prove;
 use self::saved::SavedCell;
@@ -168,6 +171,9 @@ struct Map {
     history: Vec<Learned>,
     /// By the first column and row of a tile: what its pixels have seen of each light.
     pasts: HashMap<[u32; 2], Mutex<TilePast>>,
+    /// What pixels of each kind saw, and what follows from that.
+    kinds: kinds::Seen,
+    variances: Variances,
     /// What weights are multiplied with, so that a pass takes about as long as usual; none before the first.
     scale: Option<f32>,
     /// The most that a light sends, for weights near 1.
@@ -203,6 +209,8 @@ impl Default for Map {
             full: false,
             history: Vec::new(),
             pasts: HashMap::new(),
+            kinds: kinds::Seen::default(),
+            variances: Variances::default(),
             scale: None,
             brightest: 1.0,
             plain: false,
@@ -290,6 +298,7 @@ struct TilePast {
     pasts: Vec<Past>,
     /// Of the pass at hand.
     needs: Needs,
+    seen: kinds::Seen,
 }
 
 /// What the points of a pass need, in whole numbers, so that sums do not depend on their order.
@@ -475,7 +484,9 @@ impl Map {
             let [all, free] = past::sums(&questions.weights[samples], estimates);
             let pixel = questions.points[batch.point as usize].pixel as usize;
             if let Some(past) = pasts.get_mut(pixel * lights + batch.light as usize) {
-                past.foresee((free / all).min(1.0), 1.0 / PILOT as f32);
+                let v = (free / all).min(1.0);
+                past.foresee(v, 1.0 / PILOT as f32);
+                past.vary(v, estimates.len() as f32);
             }
         }
         past::spread(pasts, questions.width as usize, lights);
@@ -485,7 +496,7 @@ impl Map {
             for share in shares.iter() {
                 let light = share.light as usize;
                 let near = Nearby::new(pasts, questions.width, point.pixel, light, lights);
-                told.add(share.expected, near.map_or(1.0, |near| near.doubt(share.expected)));
+                told.add(share.expected, near.map_or(1.0, |near| near.doubt(&self.variances)));
             }
             let bright = brightness(stage, point.diffuse, shares, self.brightest);
             needs.add(&told, bright);
@@ -882,7 +893,7 @@ impl Visibility for Auto {
         map.room = self.options.memory - map.remembered * each;
         if map.remembered > 0 {
             let each = |tile: &Tile| vec![Past::default(); tile.len() * map.remembered];
-            let pasts = |tile: &Tile| TilePast { pasts: each(tile), needs: Needs::default() };
+            let pasts = |tile: &Tile| TilePast { pasts: each(tile), ..TilePast::default() };
             map.pasts = tiles.iter().map(|tile| ([tile.x, tile.y], Mutex::new(pasts(tile)))).collect();
         }
         if let Some(before) = &self.before {
@@ -1012,7 +1023,7 @@ impl Visibility for Auto {
                     )
                 });
                 nearby.push(near);
-                let doubt = near.map_or(1.0, |near| near.doubt(share.expected));
+                let doubt = near.map_or(1.0, |near| near.doubt(&map.variances));
                 told.add(share.expected, doubt);
                 share.expected *= doubt;
                 // What a cell thinks of a border only adds noise to a pixel that has none; and of one that has not been
@@ -1080,6 +1091,7 @@ impl Visibility for Auto {
                     continue;
                 }
                 let mut open = whole;
+                let kind = near.map_or(Kind::NEW, |near| near.kind());
                 let near = near.filter(|_| thought != Known::Odds && whole.is_finite() && share.count >= FEW);
                 let doubt = near.and_then(|near| near.bins(share.expected).map(|bins| (bins, near)));
                 let first = questions.weights.len() as u32;
@@ -1118,6 +1130,7 @@ impl Visibility for Auto {
                     });
                     questions.wholes.push(open);
                     questions.usual.push(usual);
+                    questions.kinds.push(kind);
                     // For all samples of the pass, before any of them adds to it.
                     questions.before.push(point.firm.then(|| {
                         let past = past_of(&mut pasts, point.pixel, share.light, map.remembered);
@@ -1165,8 +1178,9 @@ impl Visibility for Auto {
         }
         let mut pasts = map.pasts_of(questions.place);
         let mut sums = Gain::<f64>::default();
-        let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.before);
-        for (batch, ((&whole, &usual), &before)) in questions.batches.iter().zip(told) {
+        let mut seen = kinds::Seen::default();
+        let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.before).zip(&questions.kinds);
+        for (batch, (((&whole, &usual), &before), &kind)) in questions.batches.iter().zip(told) {
             let point = &questions.points[batch.point as usize];
             if whole.is_nan() {
                 continue;
@@ -1180,6 +1194,8 @@ impl Visibility for Auto {
             let v = (free / all).min(1.0);
             let bins = &questions.bins[batch.samples.start as usize..batch.samples.end as usize];
             past.mark(v, bins, estimates);
+            past.vary(v, count);
+            seen.add(kind, v, count);
             // Where rays are the points' own, the map does not give up in any case.
             if count > 1.0 && !point.firm {
                 let radiance = stage.lights[batch.light as usize].radiance * (all / map.brightest);
@@ -1197,6 +1213,7 @@ impl Visibility for Auto {
         }
         if let Some(pasts) = &mut pasts {
             pasts.needs.gain.merge(&sums.counted());
+            pasts.seen.merge(&seen);
         }
         if doubts != Doubts::default() {
             self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
@@ -1208,11 +1225,14 @@ impl Visibility for Auto {
         if map.plain {
             return;
         }
+        let map = &mut *map;
         let mut needs = Needs::default();
         for tile in map.pasts.values_mut() {
             let tile = tile.get_mut().unwrap_or_else(|poisoned| poisoned.into_inner());
             needs.merge(&std::mem::take(&mut tile.needs));
+            map.kinds.merge(&std::mem::take(&mut tile.seen));
         }
+        map.variances = map.kinds.variances();
         map.scale = (map.remembered > 0).then(|| needs.scale());
         map.seen += u64::from(stage.shadow_rays);
         let helps = needs.gain.value().is_none_or(|gain| gain > MUCH);

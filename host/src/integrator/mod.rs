@@ -8,6 +8,7 @@ mod exact;
 mod map;
 mod stochastic;
 
+use auto::Kind;
 pub use auto::{Auto, AutoOptions, Learned, SavedMap, fingerprint};
 pub use exact::{Anew, Exact, Walled};
 pub use map::{Classes, FLATNESS, Map, MapOptions, MapTerms, PreparedMap};
@@ -162,6 +163,8 @@ pub struct Questions {
     wholes: Vec<f32>,
     /// And for each batch how many samples it would have had without what was learned.
     usual: Vec<f32>,
+    /// And for each batch what kind of pixel asked.
+    kinds: Vec<Kind>,
     /// And for each batch of a point with rays of its own what part of the light its pixel had seen on average before.
     before: Vec<Option<f32>>,
     /// The tile's first column and row.
@@ -181,6 +184,7 @@ impl Questions {
         self.bins.clear();
         self.wholes.clear();
         self.usual.clear();
+        self.kinds.clear();
         self.before.clear();
     }
 }
