@@ -198,3 +198,107 @@ fn a_target_that_is_no_number_is_free() {
         }
     }
 }
+
+/// Numbers that no scene has.
+const ODD: [f32; 10] =
+    [f32::NAN, f32::INFINITY, f32::NEG_INFINITY, 1e38, -1e38, f32::MAX, -1e30, 1e20, 1e13, -1e12];
+
+/// Now and then writes such a number to a coordinate, or to all of them.
+fn spoil(random: &mut Random, chance: f32, at: &mut [f32; 3]) {
+    if random.unit() < chance {
+        let odd = ODD[random.below(ODD.len())];
+        match random.below(4) {
+            3 => *at = [odd; 3],
+            axis => at[axis] = odd,
+        }
+    }
+}
+
+#[test]
+fn odd_points_and_targets_say_nothing_of_the_others() {
+    let mut random = Random::new(21);
+    let (mut odd, mut total) = (0, [0, 0]);
+    for trial in 0..1200 {
+        let away = random.direction() * random.between(1.0, 3.0);
+        let (u, v) = away.normalize().any_orthonormal_pair();
+        let size = random.any_scale(-1.0, 0.5).abs();
+        let mut triangles = blockers(&mut random, away, size);
+        if trial % 3 == 0 {
+            // A wall that hides all that is something.
+            let [a, b, c] = [-u - v, u - v, v].map(|at| away * 0.5 + at * 40.0);
+            triangles.push([a, b, c]);
+        }
+        let accel = Accel::from_triangles(&triangles, Quality::Fast);
+        let count = 1 + random.below(128);
+        let each = [1, 1, 2, 4, 16, 64, 70][random.below(7)];
+        let (planar, mixed) = (random.below(2) == 0, random.below(4) == 0);
+        let [of_points, of_targets] = [0; 2].map(|_| [0.0, 0.0, 0.02, 0.3][random.below(4)]);
+        let (mut points, mut ends) = (Vec::new(), Vec::new());
+        for k in 0..count {
+            let near = if planar { u * random.unit() + v * (k as f32 / 64.0) } else { random.point() };
+            let mut x = (near * 0.2).to_array();
+            spoil(&mut random, of_points, &mut x);
+            let each = if mixed { random.below(each + 1) } else { each };
+            points.push(TilePoint { x, first: ends.len() as u32, count: each as u32 });
+            for _ in 0..each {
+                let mut end = (away + (u * random.unit() + v * random.unit()) * size).to_array();
+                spoil(&mut random, of_targets, &mut end);
+                ends.push(end);
+            }
+        }
+        let first = random.below(points.len());
+        if of_points > 0.0 && trial % 2 == 0 {
+            spoil(&mut random, 1.0, &mut points[first].x);
+        }
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let flat = any.on_parallelogram(away, u * size, v * size);
+        let single = On { bvh: accel.bvh(), family: Family::Scalar };
+        let mut want = vec![0u64; ends.len().div_ceil(64)];
+        for point in &points {
+            let usual = point.x.iter().all(|at| at.abs() < 1e3);
+            odd += usize::from(!usual);
+            for i in point.first as usize..(point.first + point.count) as usize {
+                let hit = single.occluded(&Ray::segment(point.x, ends[i]), None, &mut Counts::default());
+                want[i / 64] |= u64::from(hit) << (i % 64);
+                total[usize::from(hit)] += 1;
+            }
+        }
+        let mut scratch = TileScratch::new();
+        for on in families(accel.bvh()) {
+            for targets in [any, flat] {
+                let mut blocked = vec![0; want.len()];
+                let mut counts = Counts::default();
+                on.occluded_tile(&points, &targets, None, &mut counts, &mut scratch, &mut blocked);
+                assert_eq!(counts.rays, ends.len() as u64);
+                assert_eq!(blocked, want, "{}, trial {trial}: {points:?}, {ends:?}", on.family);
+            }
+        }
+    }
+    assert!(odd > 1000 && total.iter().all(|&rays| rays > 100_000), "{odd} odd points, rays: {total:?}");
+}
+
+#[test]
+fn a_point_that_is_no_number_leaves_the_others_dark() {
+    let square = [Vec3::new(-1.0, -1.0, 1.0), Vec3::new(1.0, -1.0, 1.0), Vec3::new(1.0, 1.0, 1.0)];
+    let other = [square[0], square[2], Vec3::new(-1.0, 1.0, 1.0)];
+    let accel = Accel::from_triangles(&[square, other], Quality::Fast);
+    let [xs, ys] = [8, 1].map(|by| (0..192).map(|i| (i / by % 8) as f32 * 0.05).collect::<Vec<f32>>());
+    let zs = vec![2.0; 192];
+    let targets = Targets::new(&xs, &ys, &zs).expect("of one length");
+    for k in 0..3 {
+        for odd in ODD {
+            let mut points =
+                [0u32, 1, 2].map(|k| TilePoint { x: [k as f32 * 0.01, 0.0, 0.0], first: 64 * k, count: 64 });
+            points[k].x[1] = odd;
+            let mut want = [u64::MAX; 3];
+            want[k] = 0;
+            for on in families(accel.bvh()) {
+                let (mut blocked, mut scratch) = ([0; 3], TileScratch::new());
+                let counts = &mut Counts::default();
+                on.occluded_tile(&points, &targets, None, counts, &mut scratch, &mut blocked);
+                assert_eq!(blocked, want, "{}: {odd} in point {k}", on.family);
+            }
+        }
+    }
+}

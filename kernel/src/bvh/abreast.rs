@@ -12,10 +12,10 @@
 //! where o is how far the samples stand off the light's plane, in units of n = u x v.
 
 use super::batch::targets_from;
-use super::pyramid::{CAUTION, Forms, Shift, View, extent};
+use super::pyramid::{CAUTION, Forms, Shift, View, extent, in_range};
 use super::shaft::Shaft;
 use super::tile::TilePoint;
-use super::{Bvh, ROUNDING, Targets};
+use super::{Bvh, FARTHEST, ROUNDING, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::triangle::{NO_TRIANGLE, Sheared, Single, TriangleBlock, Turn};
@@ -56,7 +56,8 @@ impl Flat {
         let normal = u.cross(v);
         let size = normal.length_squared();
         let rows = [v.cross(normal) / size, normal.cross(u) / size, normal / size];
-        if !(size > 1e-30 && rows[0].is_finite() && rows[1].is_finite() && rows[2].is_finite()) {
+        if !(size > 1e-30 && size < 1e36 && rows[0].is_finite() && rows[1].is_finite() && rows[2].is_finite())
+        {
             return None;
         }
         let from = shaft.targets.middle + (shaft.reference - corner);
@@ -71,6 +72,13 @@ impl Flat {
             let at = rows[k].dot(from);
             (least[k], greatest[k]) = (at - spread, at + spread);
             k += 1;
+        }
+        // How far the corners are that planes are asked about.
+        let along_u = extent(u) * least[0].abs().max(greatest[0].abs());
+        let along_v = extent(v) * least[1].abs().max(greatest[1].abs());
+        let corners = far + along_u + along_v;
+        if !corners.is_finite() || corners > 1e3 * FARTHEST {
+            return None;
         }
         let reach = magnitude + shaft.reference.abs().max_element() + shaft.farthest[0];
         Some(Self {
@@ -346,6 +354,10 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
     ];
     let position = one(CAUTION * flat.position);
     let rounding = [sum(rows[0]) * position, sum(rows[1]) * position, sum(rows[2]) * position];
+    let spans = one(1.0 / (16.0 * ROUNDING * CAUTION));
+    let spans = [rounding[0] * spans, rounding[1] * spans, rounding[2] * spans];
+    let aside = [s_most + to[0].abs() + wide[0], t_most + to[1].abs() + wide[1]];
+    let clear = clear & in_range(token, spans, aside, [one(0.5), one(2.0)]);
     let clear = clear & one(0.5).lt(depth) & depth.lt(one(2.0)) & error[2].lt(one(0.01));
     let view = View {
         rounding,

@@ -292,6 +292,13 @@ impl<'a> Bvh<'a> {
             let used = |place: &usize| root.children[*place] != Child::NONE;
             (0..Node::WIDTH).filter(used).fold(0.0f32, |most, place| {
                 root.bounds.iter().flatten().fold(most, |most, axis| most.max(axis[place].abs()))
+/// Where what several segments have in common is asked at once, nothing is farther away than this along an axis, so that
+/// products of three differences are finite. Beyond, each segment is asked by itself.
+const FARTHEST: f32 = 1e11;
+
+/// And the greatest coordinate is not below this, so that the same products, times their rounding, do not vanish.
+const NEAREST: f32 = 1e-8;
+
             })
         });
         Ok(Self { nodes, blocks, magnitude, simd: Native })

@@ -21,7 +21,7 @@
 use super::batch::BatchScratch;
 use super::packet::Rays;
 use super::stream::{Start, Stream};
-use super::{Bvh, Child, Node, Part, ROUNDING, STACK, Targets};
+use super::{Bvh, Child, FARTHEST, NEAREST, Node, Part, ROUNDING, STACK, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::ray::Ray;
@@ -108,6 +108,13 @@ impl Plane {
 }
 
 impl Plane {
+    /// Where a coordinate, which is a row over that of the depth, is beyond `edge` to the side of `sign`, seen from x;
+    /// and as much beyond as the slacks of the rows say.
+    #[inline(always)]
+    fn side([row, depth]: [Vec3; 2], edge: f32, sign: f32, x: Vec3, slack: [f32; 2]) -> Self {
+        Self::new((row - depth * edge) * sign, 0.0, x, slack[0] + edge.abs() * slack[1])
+    }
+
     /// How far inside positions are.
     #[inline(always)]
     pub(super) fn at<L: Lanes>(&self, token: L::Token, [x, y, z]: [L; 3]) -> L {
@@ -299,6 +306,26 @@ struct Verdict {
     deep: u32,
 }
 
+/// What S, T and W of the scene must each exceed, and multiplied with each other, so that no form vanishes by underflow;
+/// and what they must not exceed, multiplied with each other and with what is asked of the forms.
+const RANGE: [f32; 3] = [1e-12, 1e-24, 1e34];
+
+/// Are these greatest S, T and W in range, with targets as far aside, and from as near to as far? NaN is not.
+#[inline(always)]
+pub(super) fn in_range<L: Lanes>(
+    token: L::Token,
+    [s, t, w]: [L; 3],
+    aside: [L; 2],
+    [near, far]: [L; 2],
+) -> L::Mask {
+    let [least, little, much] =
+        [L::splat(token, RANGE[0]), L::splat(token, RANGE[1]), L::splat(token, RANGE[2])];
+    let deep = w + far;
+    let most = (s + aside[0] * deep) * (t + aside[1] * deep) * deep;
+    let large = least.lt(s) & least.lt(t) & least.lt(w) & little.lt(s * t * w);
+    large & most.lt(much) & most.lt(much * near)
+}
+
 /// The sum of absolute components.
 #[inline(always)]
 pub(super) fn extent(v: Vec3) -> f32 {
@@ -308,7 +335,7 @@ pub(super) fn extent(v: Vec3) -> f32 {
 
 impl Pyramid {
     /// Aims at `count` targets from the `from`th on. False where they do not lie in one pyramid: on both sides of
-    /// x, at very different depths, or where anything is not finite.
+    /// x, at very different depths, or where anything is not finite or too far away for the forms.
     #[inline(always)]
     pub(super) fn aim<S: Simd>(
         &mut self,
@@ -402,18 +429,25 @@ impl Pyramid {
         if !(least.z > 0.0 && greatest.z <= 4.0 * least.z && finite) {
             return false;
         }
+        let sizes = Vec3::new(extent(rows[0]), extent(rows[1]), extent(rows[2]));
+        let aside = least.abs().max(greatest.abs());
+        let long = extent(columns[0]) * aside.x + extent(columns[1]) * aside.y + extent(columns[2]);
+        let spans = [sizes.x * this.reach, sizes.y * this.reach, sizes.z * this.reach];
+        if !(in_range((), spans, [aside.x, aside.y], [least.z, greatest.z])
+            && this.reach > NEAREST
+            && long * greatest.z < FARTHEST)
+        {
+            return false;
+        }
         let position = 16.0 * ROUNDING * this.reach;
-        this.rounding = Vec3::new(extent(rows[0]), extent(rows[1]), extent(rows[2])) * (CAUTION * position);
-        let slack = |row: Vec3, edge: f32| 4.0 * position * (extent(row) + edge.abs() * extent(rows[2]));
-        let side = |row: Vec3, edge: f32, sign: f32| {
-            Plane::new((row - rows[2] * edge) * sign, 0.0, x, slack(row, edge))
-        };
+        this.rounding = sizes * (CAUTION * position);
+        let slack = [4.0 * position * sizes.x, 4.0 * position * sizes.y, 4.0 * position * sizes.z];
         this.planes = [
-            side(rows[0], least.x, 1.0),
-            side(rows[0], greatest.x, -1.0),
-            side(rows[1], least.y, 1.0),
-            side(rows[1], greatest.y, -1.0),
-            Plane::new(-rows[2], greatest.z, x, 4.0 * position * extent(rows[2])),
+            Plane::side([rows[0], rows[2]], least.x, 1.0, x, [slack[0], slack[2]]),
+            Plane::side([rows[0], rows[2]], greatest.x, -1.0, x, [slack[0], slack[2]]),
+            Plane::side([rows[1], rows[2]], least.y, 1.0, x, [slack[1], slack[2]]),
+            Plane::side([rows[1], rows[2]], greatest.y, -1.0, x, [slack[1], slack[2]]),
+            Plane::new(-rows[2], greatest.z, x, slack[2]),
         ];
         let mut k = 0;
         while k < 8 {
@@ -503,7 +537,8 @@ impl Pyramid {
         while axis < 2 {
             let (least, greatest) = (self.least[axis], self.greatest[axis]);
             let width = greatest - least;
-            let scale = if width > 0.0 { CELLS as f32 / width } else { 0.0 };
+            // So narrow a range is not cut, for the scale must be finite.
+            let scale = if width > 1e-30 { CELLS as f32 / width } else { 0.0 };
             self.scale[axis] = scale;
             let values = if axis == 0 { &self.s } else { &self.t };
             let mut cells = [0u64; CELLS];

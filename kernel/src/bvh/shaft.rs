@@ -9,7 +9,7 @@
 //! Workshop on Rendering 1991).
 
 use super::pyramid::{Plane, extent};
-use super::{Node, ROUNDING};
+use super::{FARTHEST, NEAREST, Node, ROUNDING};
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::triangle::TriangleBlock;
 use crate::vec3x;
@@ -123,7 +123,7 @@ pub(super) struct Shaft {
 
 impl Shaft {
     /// Around two boxes, both from `reference`. `magnitude` bounds every coordinate of the scene. `None` where
-    /// anything is not finite.
+    /// anything is not finite, or too far away for the planes.
     #[inline(always)]
     pub(super) fn new(reference: Vec3, points: &Turned, targets: &Turned, magnitude: f32) -> Option<Self> {
         let reach = magnitude + reference.abs().max_element();
@@ -131,15 +131,20 @@ impl Shaft {
         let mut corners = [Vec3::ZERO; 16];
         let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
         let mut farthest = [0.0f32; 2];
+        // Not finite if any corner is not; the least and the greatest may lose what is not a number.
+        let mut sum = Vec3::ZERO;
         let mut k = 0;
         while k < 16 {
             let corner = if k < 8 { points.corner(k) } else { targets.corner(k & 7) };
             (lower, upper) = (lower.min(corner), upper.max(corner));
             corners[k] = corner;
+            sum += corner;
             farthest[k / 8] = farthest[k / 8].max(corner.abs().max_element());
             k += 1;
         }
-        if !(lower.is_finite() && upper.is_finite()) {
+        let most = farthest[0].max(farthest[1]).max(reference.abs().max_element());
+        // Written so that NaN fails.
+        if !(sum.is_finite() && most < FARTHEST && reach > NEAREST) {
             return None;
         }
         let mut planes = [Plane::default(); PLANES];
