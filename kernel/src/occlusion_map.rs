@@ -117,10 +117,12 @@ impl CellKey {
         (self.0 >> 51) as u32
     }
 
+    /// Light and level are in the upper half, which a product alone would not carry down to the index.
     #[inline]
     fn hash(self) -> usize {
-        let mixed = self.0.wrapping_mul(0x9e37_79b9_7f4a_7c15);
-        (mixed ^ mixed >> 29) as usize
+        let folded = self.0 ^ self.0 >> 32;
+        let mixed = folded.wrapping_mul(0x9e37_79b9_7f4a_7c15);
+        (mixed ^ mixed >> 32) as usize
     }
 }
 
@@ -853,5 +855,61 @@ impl<'a> OcclusionMap<'a> {
             at = (at + 1) & (self.table.len() - 1);
         }
         None
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    const MOST: usize = 1 << 13;
+
+    /// The longest search among as many cells, in a table as long as it should be.
+    fn longest(cells: usize, key: impl Fn(usize) -> CellKey) -> usize {
+        let mut table = [false; OcclusionMap::table(MOST)];
+        let last = OcclusionMap::table(cells) - 1;
+        let mut longest = 0;
+        for i in 0..cells {
+            let mut at = key(i).hash() & last;
+            let mut steps = 1;
+            while table[at] {
+                at = (at + 1) & last;
+                steps += 1;
+            }
+            table[at] = true;
+            longest = longest.max(steps);
+        }
+        longest
+    }
+
+    fn key(x: [usize; 3], side: usize, level: i32, light: usize) -> CellKey {
+        let size = f32::from_bits(((127 + level) as u32) << 23);
+        let mut normal = [0.0; 3];
+        normal[side / 2] = if side & 1 == 0 { 1.0 } else { -1.0 };
+        let x = x.map(|at| (at as f32 - 16.0 + 0.5) * size);
+        CellKey::new(x, normal, level, light as u32).expect("near the origin")
+    }
+
+    #[test]
+    fn cells_spread_over_the_table() {
+        for cube in [[16, 16, 16], [3, 40, 18]] {
+            let lights = longest(CellKey::LIGHTS as usize, |i| key(cube, 0, -2, i));
+            assert!(lights <= 4, "the lights of {cube:?}: {lights}");
+        }
+        for (axis, edge) in [(0, 8), (1, 16), (2, 64)] {
+            // A square of cubes, and as many lights of each as there is room for.
+            let at = |i: usize| {
+                let mut x = [16; 3];
+                (x[(axis + 1) % 3], x[(axis + 2) % 3]) = (i % edge, i / edge % edge);
+                key(x, 2 * axis, -2, i / (edge * edge))
+            };
+            let steps = longest(MOST, at);
+            assert!(steps <= 32, "{edge} by {edge} cubes: {steps}");
+        }
+        let grid = longest(MOST, |i| key([i % 20, i / 20 % 20, i / 400], 5, -3, 0));
+        assert!(grid <= 32, "a grid: {grid}");
+        let levels =
+            longest(MOST, |i| key([i % 8, i / 8 % 8, i / 64 % 8], i / 512 % 6, -6 + (i / 3072) as i32, 0));
+        assert!(levels <= 32, "sides and levels: {levels}");
     }
 }
