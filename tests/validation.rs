@@ -195,7 +195,16 @@ fn vertices() {
         let nodes = [node(&[Child::leaf(1)])];
         let want = Some(BvhError::Vertex { block: 1, lane: 2 });
         assert_eq!(error(&nodes, &[TriangleBlock::EMPTY, block]), want);
+        // Also where no triangle is.
+        block.ids = [NO_TRIANGLE; 8];
+        assert_eq!(error(&nodes, &[TriangleBlock::EMPTY, block]), want);
     }
+}
+
+#[test]
+#[should_panic(expected = "no child can name this node")]
+fn indices_of_nodes_that_look_like_leaves() {
+    let _ = Child::node(Child::MAX_INDEX + 1);
 }
 
 #[test]

@@ -124,9 +124,10 @@ impl Child {
     /// The greatest index of a node that fits.
     pub const MAX_INDEX: u32 = Self::LEAF - 2;
 
-    /// An inner node, by its index.
+    /// An inner node, by its index. Panics if that is above [`Child::MAX_INDEX`].
     #[inline(always)]
     pub const fn node(index: u32) -> Self {
+        assert!(index <= Self::MAX_INDEX, "no child can name this node");
         Self(index)
     }
 
@@ -222,7 +223,7 @@ pub enum BvhError {
         /// A node met when all were counted already.
         node: u32,
     },
-    /// A used lane of a block holds a vertex that is NaN or infinite.
+    /// A lane of a block, used or not, holds a vertex that is NaN or infinite.
     Vertex {
         /// The block.
         block: u32,

@@ -50,6 +50,7 @@ impl<'a> Levels<'a> {
     }
 
     /// What to return if this level is the first that blocks, having been asked; 1 if none of those asked does.
+    /// Panics if there is no such level.
     #[inline]
     pub fn value(&self, blocked: Option<usize>) -> f32 {
         match blocked {
@@ -72,7 +73,7 @@ impl<'a> Levels<'a> {
         1.0
     }
 
-    /// The variance where this level is the first to block, or none is.
+    /// The variance where this level is the first to block, or none is. Panics if there is no such level.
     pub fn variance(&self, blocked: Option<usize>) -> f64 {
         blocked.map_or(0.0, |level| 1.0 / f64::from(self.0[level]) - 1.0)
     }
@@ -104,7 +105,7 @@ impl<'a> Levels<'a> {
     /// ```
     ///
     /// cut off at 1 and pooled where they would grow, and at least `least`. The slices must be of one length, or the
-    /// shortest counts. Costs the square of the number of levels.
+    /// shortest counts. Panics if `least` is NaN. Costs the square of the number of levels.
     pub fn best(first: &[f64], costs: &[f64], least: f32, reach: &mut [f32]) {
         let count = reach.len().min(first.len()).min(costs.len());
         let reach = &mut reach[..count];
