@@ -2,7 +2,9 @@
 
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
-use occlude_kernel::{BatchScratch, Bvh, Counts, Hit, Ray, RayPacket, Targets, TilePoint, TileScratch};
+use occlude_kernel::{
+    BatchScratch, Bvh, Counts, Hit, Node, Ray, RayPacket, Targets, TilePoint, TileScratch, TriangleBlock,
+};
 use occlude_tests::{Family, On, Oracle, Random, Triangle, all_bits, bits, families, meshes, single_node};
 use proptest::prelude::*;
 use std::ops::ControlFlow;
@@ -240,6 +242,125 @@ fn every_scale_and_place() {
             Case::new(meshes::moved(&soup, scale, shift)).check_random(&mut random, 15);
         }
     }
+}
+
+/// Any tree, larger or smaller by a power of 2: nothing is rounded by that.
+fn scaled(accel: &Accel, by: f32) -> (Vec<Node>, Vec<TriangleBlock>) {
+    let bvh = accel.bvh();
+    let (mut nodes, mut blocks) = (bvh.nodes().to_vec(), bvh.blocks().to_vec());
+    nodes
+        .iter_mut()
+        .flat_map(|node| node.bounds.as_flattened_mut().as_flattened_mut())
+        .for_each(|at| *at *= by);
+    let vertices = blocks.iter_mut().flat_map(|block| block.vertices.as_flattened_mut().as_flattened_mut());
+    vertices.for_each(|at| *at *= by);
+    (nodes, blocks)
+}
+
+/// What a query says of rays: hits as bits, and what is blocked.
+type Answers = (String, Vec<Option<[u32; 4]>>, Vec<bool>);
+
+/// What every query of every family says of a tile at a scale.
+fn at_scale(accel: &Accel, scale: i32, points: &[Vec3], ends: &[Vec3], light: [Vec3; 3]) -> Vec<Answers> {
+    let by = 2f32.powi(scale);
+    let (nodes, blocks) = scaled(accel, by);
+    let bvh = Bvh::new(&nodes, &blocks).expect("within the limit");
+    let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis] * by).collect::<Vec<f32>>());
+    let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+    let [corner, u, v] = light.map(|at| at * by);
+    let each = ends.len() / points.len();
+    let counts = &mut Counts::default();
+    let rays: Vec<Ray> = (0..ends.len()).map(|i| Ray::segment(points[i / each] * by, ends[i] * by)).collect();
+    let mut answers = Vec::new();
+    for on in families(bvh) {
+        let hits =
+            rays.iter().map(|ray| on.closest(ray, None, counts).map(|hit| bits(&hit))).collect::<Vec<_>>();
+        let blocked = rays.iter().map(|ray| on.occluded(ray, None, counts)).collect();
+        answers.push((format!("{}, single", on.family), hits, blocked));
+        let (mut hits, mut blocked) = (Vec::new(), Vec::new());
+        for rays in rays.chunks(16) {
+            let (packet, active) = (RayPacket::new(rays), u32::MAX >> (32 - rays.len()));
+            let found = on.closest_packet(&packet, active, None, counts);
+            let any = on.occluded_packet(&packet, active, None, counts);
+            for i in 0..rays.len() {
+                hits.push((found.hit >> i & 1 != 0).then(|| bits(&found.hits[i])));
+                blocked.push(any >> i & 1 != 0);
+            }
+        }
+        answers.push((format!("{}, packet", on.family), hits.clone(), blocked));
+        for (name, targets) in [("any", any), ("flat", any.on_parallelogram(corner, u, v))] {
+            let mut blocked = Vec::new();
+            for (k, &x) in points.iter().enumerate() {
+                let [xs, ys, zs] = [&xs, &ys, &zs].map(|at| &at[k * each..(k + 1) * each]);
+                let mut targets = Targets::new(xs, ys, zs).expect("of one length");
+                if name == "flat" {
+                    targets = targets.on_parallelogram(corner, u, v);
+                }
+                let (mut words, scratch) = ([0; 2], &mut BatchScratch::new());
+                on.occluded_batch((x * by).into(), &targets, None, counts, scratch, &mut words);
+                blocked.extend((0..each).map(|i| words[i / 64] >> (i % 64) & 1 != 0));
+            }
+            answers.push((format!("{}, batch, {name}", on.family), hits.clone(), blocked));
+            let tile: Vec<TilePoint> = points
+                .iter()
+                .enumerate()
+                .map(|(k, &x)| TilePoint { x: (x * by).into(), first: (k * each) as u32, count: each as u32 })
+                .collect();
+            let (mut words, scratch) = (vec![0; ends.len().div_ceil(64)], &mut TileScratch::new());
+            on.occluded_tile(&tile, &targets, None, counts, scratch, &mut words);
+            let blocked = (0..ends.len()).map(|i| words[i / 64] >> (i % 64) & 1 != 0).collect();
+            answers.push((format!("{}, tile, {name}", on.family), hits.clone(), blocked));
+        }
+    }
+    answers
+}
+
+#[test]
+fn every_query_says_the_same_at_every_scale() {
+    let mut random = Random::new(31);
+    let largest = Bvh::MAX_COORDINATE.log2() as i32 - 3;
+    let mut total = [0, 0];
+    for trial in 0..60 {
+        let away = random.direction() * random.between(1.0, 3.0);
+        let (u, v) = away.normalize().any_orthonormal_pair();
+        let size = random.any_scale(-1.5, 0.0).abs();
+        let (u, v) = (u * size, v * size);
+        let count = [0, 8, 100][random.below(3)];
+        let mut triangles: Vec<Triangle> = (0..count)
+            .map(|_| {
+                let (middle, wide) =
+                    (away * random.unit() + random.point(), random.any_scale(-2.0, 0.0).abs());
+                [middle, middle + random.point() * wide, middle + random.point() * wide]
+            })
+            .collect();
+        // A square hides all of the light, half of it, or nothing.
+        let middle = (away + (u + v) * 0.5) * 0.5 + u * (random.below(3) as f32 / size);
+        let [a, b, c, d] = [-u - v, u - v, u + v, v - u].map(|at| middle + at / size);
+        triangles.extend([[a, b, c], [a, c, d]]);
+        let accel = Accel::from_triangles(&triangles, Quality::Medium);
+        let each = [1, 4, 16, 64][random.below(4)];
+        let points: Vec<Vec3> = (0..64)
+            .map(|k| (u * (k % 8) as f32 + v * (k / 8) as f32) * 0.02 + random.point() * 1e-3)
+            .collect();
+        let ends: Vec<Vec3> = (0..64 * each).map(|_| away + u * random.unit() + v * random.unit()).collect();
+        let want = at_scale(&accel, 0, &points, &ends, [away, u, v]);
+        want[0].2.iter().for_each(|&blocked| total[usize::from(blocked)] += 1);
+        want.iter().for_each(|(query, _, blocked)| assert_eq!(*blocked, want[0].2, "{query}, trial {trial}"));
+        for scale in [-33, -30, -20, -10, 10, 20, largest] {
+            let got = at_scale(&accel, scale, &points, &ends, [away, u, v]);
+            for (want, got) in want.iter().zip(&got) {
+                assert_eq!(want.0, got.0);
+                let differ = want.1.iter().zip(&got.1).filter(|(a, b)| a != b).count();
+                let other = want.2.iter().zip(&got.2).filter(|(a, b)| a != b).count();
+                assert!(
+                    differ + other == 0,
+                    "{}, trial {trial}, scale {scale}: {differ} hits, {other} answers",
+                    want.0
+                );
+            }
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
 }
 
 #[test]

@@ -400,9 +400,11 @@ fn short_and_long_directions_agree() {
 #[test]
 fn huge_numbers_agree() {
     let mut random = Random::new(10);
-    for scale in [1e5, 1e8, 1e12, 1e15, 1e18, 1e25, 1e37] {
+    for scale in [1e5f32, 1e8, 1e12, 1e15, 1e18, 1e25, 1e37] {
         for _ in 0..20 {
-            let triangles = meshes::moved(&meshes::soup(&mut random, 16, 1.0), scale, Vec3::ZERO);
+            let soup = meshes::soup(&mut random, 16, 1.0);
+            // Beyond this only rays may be.
+            let triangles = meshes::moved(&soup, scale.min(3e9), Vec3::ZERO);
             let rays: Vec<Ray> = (0..32)
                 .map(|i| match i % 4 {
                     0 => Ray::segment(random.point() * scale, random.point() * scale),

@@ -202,6 +202,21 @@ fn vertices() {
 }
 
 #[test]
+fn vertices_too_far_away() {
+    let most = Bvh::MAX_COORDINATE;
+    for (at, far) in [(most, false), (most.next_up(), true), (1e13, true), (f32::MAX, true)] {
+        for at in [at, -at] {
+            let mut block = TriangleBlock::EMPTY;
+            block.vertices[2][1][5] = at;
+            let want = far.then_some(BvhError::TooFar { block: 0, lane: 5 });
+            assert_eq!(error(&[], &[block]), want, "{at:e}");
+        }
+    }
+    let message = BvhError::TooFar { block: 3, lane: 5 }.to_string();
+    assert!(["3", "5", "1e10"].iter().all(|part| message.contains(part)), "{message}");
+}
+
+#[test]
 #[should_panic(expected = "no child can name this node")]
 fn indices_of_nodes_that_look_like_leaves() {
     let _ = Child::node(Child::MAX_INDEX + 1);

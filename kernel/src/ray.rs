@@ -4,8 +4,10 @@ use glam::Vec3;
 
 /// A half-open stretch of a line: the points `origin + t * direction` with `t_min < t <= t_max`.
 ///
-/// The direction need not be of unit length; `t` counts in its units. A direction of zero, or anything that is
-/// NaN or infinite, makes a ray that hits nothing; only `t_min` may be minus infinity, and `t_max` infinity.
+/// The direction need not be of unit length; `t` counts in its units. A direction of zero, or whose components are all
+/// below 1e-27, makes a ray that hits nothing, and so does anything that is NaN or infinite; only `t_min` may be minus
+/// infinity, and `t_max` infinity. Hits are found, and their `t` is right, as long as no difference between the origin
+/// and a vertex is above 1e12 along an axis; see [`Bvh::new`](crate::Bvh::new).
 #[derive(Clone, Copy, Debug, PartialEq)]
 pub struct Ray {
     /// Where `t` is 0.

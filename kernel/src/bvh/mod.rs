@@ -230,6 +230,13 @@ pub enum BvhError {
         /// The lane.
         lane: u32,
     },
+    /// A lane of a block, used or not, holds a vertex beyond [`Bvh::MAX_COORDINATE`].
+    TooFar {
+        /// The block.
+        block: u32,
+        /// The lane.
+        lane: u32,
+    },
     /// More nodes or blocks than an index can name.
     TooMany,
 }
@@ -247,6 +254,9 @@ impl fmt::Display for BvhError {
             Self::TooDeep { node } => write!(f, "node {node}: deeper than {} levels", MAX_DEPTH),
             Self::Shared { node } => write!(f, "node {node}: has more than one parent"),
             Self::Vertex { block, lane } => write!(f, "block {block}, lane {lane}: a vertex is not finite"),
+            Self::TooFar { block, lane } => {
+                write!(f, "block {block}, lane {lane}: a vertex is beyond {:e}", Bvh::MAX_COORDINATE)
+            }
             Self::TooMany => {
                 write!(f, "more than {} nodes or {} blocks", Child::MAX_INDEX, Child::MAX_BLOCK)
             }
@@ -282,17 +292,6 @@ const ALL_LANES: u32 = 0xff;
 /// One unit in the last place of 1, halved: how far rounding moves a number, relative to it.
 const ROUNDING: f32 = f32::EPSILON / 2.0;
 
-impl<'a> Bvh<'a> {
-    /// A tree whose root is the first node; no nodes make an empty scene.
-    ///
-    /// Checked: indices, order (children come after their parents), depth, boxes and vertices. Not checked: that
-    /// a box holds what is below it; triangles outside their boxes are not found. Costs one look at everything.
-    pub fn new(nodes: &'a [Node], blocks: &'a [TriangleBlock]) -> Result<Self, BvhError> {
-        check(nodes, blocks)?;
-        let magnitude = nodes.first().map_or(0.0, |root| {
-            let used = |place: &usize| root.children[*place] != Child::NONE;
-            (0..Node::WIDTH).filter(used).fold(0.0f32, |most, place| {
-                root.bounds.iter().flatten().fold(most, |most, axis| most.max(axis[place].abs()))
 /// Where what several segments have in common is asked at once, nothing is farther away than this along an axis, so that
 /// products of three differences are finite. Beyond, each segment is asked by itself.
 const FARTHEST: f32 = 1e11;
@@ -300,6 +299,28 @@ const FARTHEST: f32 = 1e11;
 /// And the greatest coordinate is not below this, so that the same products, times their rounding, do not vanish.
 const NEAREST: f32 = 1e-8;
 
+impl<'a> Bvh<'a> {
+    /// The greatest coordinate that vertices may have, of either sign.
+    ///
+    /// The triangle test multiplies three differences of positions; beyond 1e12 that overflows, and hits get lost.
+    pub const MAX_COORDINATE: f32 = 1e10;
+
+    /// A tree whose root is the first node; no nodes make an empty scene.
+    ///
+    /// Checked: indices, order (children come after their parents), depth, boxes and vertices. Not checked: that
+    /// a box holds what is below it; triangles outside their boxes are not found. Costs one look at everything.
+    ///
+    /// What scale a scene has does not matter, within limits: from a greatest coordinate of 1e-9 to
+    /// [`Bvh::MAX_COORDINATE`] all queries give the answers that they give of the same scene at any other scale. The
+    /// products of smaller scenes vanish, and hits get lost, or lose their `t`: measure those in smaller units. Points and
+    /// targets may be anywhere. Beyond 1e11 each segment is asked by itself, which takes longer, and beyond 1e12 it may
+    /// miss what it should hit; but all queries agree about that too.
+    pub fn new(nodes: &'a [Node], blocks: &'a [TriangleBlock]) -> Result<Self, BvhError> {
+        check(nodes, blocks)?;
+        let magnitude = nodes.first().map_or(0.0, |root| {
+            let used = |place: &usize| root.children[*place] != Child::NONE;
+            (0..Node::WIDTH).filter(used).fold(0.0f32, |most, place| {
+                root.bounds.iter().flatten().fold(most, |most, axis| most.max(axis[place].abs()))
             })
         });
         Ok(Self { nodes, blocks, magnitude, simd: Native })
@@ -371,9 +392,16 @@ fn check(nodes: &[Node], blocks: &[TriangleBlock]) -> Result<(), BvhError> {
     }
     for (index, block) in blocks.iter().enumerate() {
         for lane in 0..TriangleBlock::WIDTH {
-            let finite = block.vertices.iter().flatten().all(|axis| axis[lane].is_finite());
-            if !finite {
-                return Err(BvhError::Vertex { block: index as u32, lane: lane as u32 });
+            // NaN is within nothing.
+            let within = |most: f32| block.vertices.iter().flatten().all(|axis| axis[lane].abs() <= most);
+            if !within(Bvh::MAX_COORDINATE) {
+                let finite = within(f32::MAX);
+                let (block, lane) = (index as u32, lane as u32);
+                return Err(if finite {
+                    BvhError::TooFar { block, lane }
+                } else {
+                    BvhError::Vertex { block, lane }
+                });
             }
         }
     }
