@@ -302,3 +302,31 @@ fn a_point_that_is_no_number_leaves_the_others_dark() {
         }
     }
 }
+
+/// Asks for points that name targets there are not, of an empty scene or of another.
+fn ask_beyond(triangles: &[Triangle], first: u32, count: u32) {
+    let accel = Accel::from_triangles(triangles, Quality::Fast);
+    let on = On { bvh: accel.bvh(), family: Family::Scalar };
+    let targets = Targets::new(&[0.0; 3], &[0.0; 3], &[2.0; 3]).expect("of one length");
+    let points = [TilePoint { x: [0.0; 3], first, count }];
+    let (mut scratch, mut blocked) = (TileScratch::new(), [0; 4]);
+    on.occluded_tile(&points, &targets, None, &mut Counts::default(), &mut scratch, &mut blocked);
+}
+
+#[test]
+#[should_panic(expected = "targets that do not exist")]
+fn targets_beyond_the_slice_of_an_empty_scene() {
+    ask_beyond(&[], 2, 2);
+}
+
+#[test]
+#[should_panic(expected = "targets that do not exist")]
+fn targets_beyond_all_numbers() {
+    ask_beyond(&[[Vec3::ZERO, Vec3::X, Vec3::Y]], u32::MAX, 2);
+}
+
+#[test]
+fn a_point_without_targets_may_name_any() {
+    ask_beyond(&[], u32::MAX, 0);
+    ask_beyond(&[[Vec3::ZERO, Vec3::X, Vec3::Y]], 5, 0);
+}

@@ -319,6 +319,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut whole = (0, 0);
         while k < points.len() {
             let (first, end) = run(points, &mut k);
+            assert!(end == first || end <= targets.len(), "a point names targets that do not exist");
             clear(blocked, first, end - first);
             rays += end - first;
             whole = (first, end);
@@ -498,7 +499,7 @@ impl<S: Simd> Bvh<'_, S> {
                 continue;
             }
             let TilePoint { x, first, count } = points[k];
-            let (mut from, end) = (first as usize, (first + count) as usize);
+            let (mut from, end) = (first as usize, first as usize + count as usize);
             while from < end {
                 let part = (end - from).min(MOST);
                 if part < FEW || (!complete && part < MIXED) {
@@ -1073,24 +1074,25 @@ pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
 #[inline(always)]
 fn run(points: &[TilePoint], k: &mut usize) -> (usize, usize) {
     let rest = &points[*k..];
-    let first = rest[0].first;
+    let first = rest[0].first as usize;
     let mut end = first;
     let mut i = 0;
-    while i < rest.len() && rest[i].first == end {
-        end += rest[i].count;
+    while i < rest.len() && rest[i].first as usize == end {
+        // Beyond the greatest index there is no target, whatever the width of an index.
+        end = end.saturating_add(rest[i].count as usize);
         i += 1;
     }
     *k += i;
-    (first as usize, end as usize)
+    (first, end)
 }
 
 /// How many of the first points, up to 64, have a target each, one after the other?
 #[inline(always)]
 fn one_each(points: &[TilePoint]) -> usize {
     let points = &points[..points.len().min(MOST)];
-    let mut next = points[0].first;
+    let mut next = points[0].first as usize;
     let mut k = 0;
-    while k < points.len() && points[k].count == 1 && points[k].first == next {
+    while k < points.len() && points[k].count == 1 && points[k].first as usize == next {
         next += 1;
         k += 1;
     }
