@@ -48,3 +48,8 @@ pub use occlusion_map::OcclusionMap;
 pub use photons::{LightPhoton, OcclusionPhoton, PhotonMap};
 pub use ray::{Hit, Ray, RayPacket};
 pub use triangle::{NO_TRIANGLE, TriangleBlock};
+
+/// Its code is compiled with the examples.
+#[cfg(all(doctest, feature = "dispatch"))]
+#[doc = include_str!("../README.md")]
+struct Readme;
