@@ -6,7 +6,7 @@
 //! |---|---|---|
 //! | [`Scalar`] | one `f32` | by the caller; the reference for the others |
 //! | [`Native`] | the vectors of `wide` | when the crate is compiled, by `-C target-cpu` |
-//! | `Dispatched` (feature `dispatch`) | the vectors of `fearless_simd` | at run time, by the CPU |
+//! | `Dispatched` (feature `dispatch`) | the vectors of `fearless_simd` | at run time, by the CPU: see the example of `Task` |
 //!
 //! Whatever decides an answer is computed with single operations, each rounded as IEEE 754 says, in the same
 //! order at every width. So all families give the same answers, bit for bit. Only bounds, which are

@@ -57,6 +57,57 @@ fn apart<S: fearless_simd::Simd, R>(token: S, work: impl FnOnce() -> R) -> R {
 
 /// Work that is compiled once for each level. `run` and all it calls must be `#[inline(always)]`, or they are
 /// compiled for the lowest level.
+///
+/// A tile of work is a struct of what it needs, and `run` asks a tree that is told the level's vectors:
+///
+/// ```
+/// use occlude_kernel::lanes::{Task, detect, dispatch};
+/// use occlude_kernel::{Bvh, Child, Node, Simd, Targets, TilePoint, TileScratch, TriangleBlock, Uncounted};
+///
+/// struct Shadows<'t> {
+///     bvh: Bvh<'t>,
+///     points: &'t [TilePoint],
+///     light: Targets<'t>,
+///     scratch: &'t mut TileScratch,
+///     blocked: &'t mut [u64],
+/// }
+///
+/// impl Task for Shadows<'_> {
+///     type Output = u32;
+///
+///     #[inline(always)]
+///     fn run<S: Simd>(self, simd: S) -> u32 {
+///         let bvh = self.bvh.on(simd);
+///         bvh.occluded_tile(self.points, &self.light, None, &mut Uncounted, self.scratch, self.blocked);
+///         count(self.blocked)
+///     }
+/// }
+///
+/// // Whatever a task calls, too.
+/// #[inline(always)]
+/// fn count(blocked: &[u64]) -> u32 {
+///     let mut sum = 0;
+///     for word in blocked {
+///         sum += word.count_ones();
+///     }
+///     sum
+/// }
+///
+/// let mut block = TriangleBlock::EMPTY;
+/// block.set(0, [[-1.0, -1.0, 1.0], [1.0, -1.0, 1.0], [0.0, 1.0, 1.0]], 0);
+/// let mut root = Node::EMPTY;
+/// root.set(0, [-1.0, -1.0, 1.0], [1.0, 1.0, 1.0], Child::leaf(0));
+/// let (nodes, blocks) = ([root], [block]);
+/// let bvh = Bvh::new(&nodes, &blocks)?;
+///
+/// let points = [0u32, 1].map(|k| TilePoint { x: [0.1 * k as f32, 0.0, 0.0], first: 2 * k, count: 2 });
+/// let light = Targets::new(&[0.0, 9.0, 0.0, 9.0], &[0.0; 4], &[2.0; 4]).expect("of one length");
+/// let (mut scratch, mut blocked) = (TileScratch::new(), [0]);
+/// let level = detect(); // once, at the start
+/// let (scratch, blocked) = (&mut scratch, &mut blocked[..]);
+/// assert_eq!(dispatch(level, Shadows { bvh, points: &points, light, scratch, blocked }), 2);
+/// # Ok::<(), occlude_kernel::BvhError>(())
+/// ```
 pub trait Task {
     /// What it gives.
     type Output;
