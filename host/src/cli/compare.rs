@@ -4,6 +4,7 @@ use std::fmt::Write as _;
 use std::io::{ErrorKind, Write as _};
 use std::path::{Path, PathBuf};
 
+use super::render::finite;
 use crate::error::{Error, Result};
 use crate::film::Image;
 use crate::metrics::flip::{self, flip};
@@ -24,7 +25,7 @@ pub struct CompareArgs {
     #[arg(short, long, value_name = "DIFF.png")]
     pub output: Option<PathBuf>,
     /// Exposure at which FLIP looks at the images, in stops
-    #[arg(long, value_name = "EV", default_value_t = 0.0, allow_negative_numbers = true)]
+    #[arg(long, value_name = "EV", default_value_t = 0.0, allow_negative_numbers = true, value_parser = finite)]
     pub exposure: f32,
     /// Print JSON instead of a table
     #[arg(long)]
@@ -243,6 +244,10 @@ mod tests {
         <Parser as clap::CommandFactory>::command().debug_assert();
         let a = args(&["a.exr", "b.exr", "-o", "d.png", "--exposure", "-1.5", "--json"]);
         assert_eq!((a.output, a.exposure, a.json), (Some("d.png".into()), -1.5, true));
+        for exposure in ["nan", "inf", "bright"] {
+            let line = ["compare", "a.exr", "b.exr", "--exposure", exposure];
+            assert!(<Parser as clap::Parser>::try_parse_from(line).is_err(), "{exposure}");
+        }
     }
 
     #[test]

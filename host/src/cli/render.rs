@@ -339,7 +339,7 @@ impl Chosen {
     }
 }
 
-fn finite(text: &str) -> std::result::Result<f32, String> {
+pub(super) fn finite(text: &str) -> std::result::Result<f32, String> {
     let value: f32 = text.parse().map_err(|_| "not a number".to_owned())?;
     if value.is_finite() { Ok(value) } else { Err("must be finite".to_owned()) }
 }
