@@ -292,6 +292,21 @@ fn errors_end_with_two_and_name_the_cause() {
     );
 }
 
+#[cfg(unix)]
+#[test]
+fn statistics_go_down_a_pipe() {
+    let folder = tempfile::tempdir().expect("a folder");
+    for to in ["/dev/stdout", "/dev/stderr"] {
+        let args =
+            ["render", &scene("plates"), "-o", "a.pfm", "--size", "8x8", "--spp", "1", "-q", "--stats", to];
+        let done = occlude(&args, folder.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+        let said = if to == "/dev/stdout" { done.stdout } else { done.stderr };
+        let stats: serde_json::Value = serde_json::from_str(&text(&said)).expect("JSON");
+        assert_eq!(stats["counts"]["camera_rays"], 64);
+    }
+}
+
 #[test]
 fn what_is_generated_renders() {
     let folder = tempfile::tempdir().expect("a folder");

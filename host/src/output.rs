@@ -12,7 +12,7 @@
 //! existing file keeps its permissions, and a device or pipe is written to directly.
 
 use std::fs::{self, Metadata};
-use std::io::{Cursor, Write};
+use std::io::{Cursor, ErrorKind, Write};
 use std::path::{Path, PathBuf};
 
 use exr::prelude as openexr;
@@ -125,7 +125,7 @@ pub fn check_writable_bytes(path: impl AsRef<Path>) -> Result<()> {
 pub fn read(path: impl AsRef<Path>) -> Result<Image> {
     let path = path.as_ref();
     let format = Format::of(path)?;
-    let bytes = fs::read(path).map_err(Error::io("reading", path))?;
+    let bytes = fs::read(path).map_err(Error::io("reading the image", path))?;
     let decoded = match format {
         Format::Png => decode_image(&bytes, image::ImageFormat::Png),
         Format::Exr => decode_exr(&bytes),
@@ -160,27 +160,42 @@ struct Destination<'a> {
 
 impl<'a> Destination<'a> {
     fn of(asked: &'a Path) -> Result<Self> {
+        let destination = Self::of_any(asked)?;
+        if destination.existing.as_ref().is_some_and(|m| m.permissions().readonly()) {
+            let what = "it exists and is read-only; remove it or choose another name";
+            return Err(Error::Usage(format!("writing {}: {what}", asked.display())));
+        }
+        Ok(destination)
+    }
+
+    /// The same for a file that may be read-only.
+    fn of_any(asked: &'a Path) -> Result<Self> {
         let mut file = asked.to_owned();
+        // The links to a pipe lead nowhere, as those of /dev/stdout may.
+        let is_special = fs::metadata(asked).is_ok_and(|m| !m.is_file() && !m.is_dir());
         // By hand, because the link may point to a file that is yet to be made.
-        for _ in 0..40 {
+        let most = if is_special { 0 } else { 40 };
+        for _ in 0..most {
             let Ok(target) = fs::read_link(&file) else { break };
             file = folder(&file).join(target);
         }
         let refuse = |why: String| Err(Error::Usage(format!("writing {}: {why}", asked.display())));
-        if file.is_symlink() {
+        if !is_special && file.is_symlink() {
             return refuse("it is a symbolic link that leads back to itself".into());
         }
         let existing = fs::metadata(&file).ok();
         if existing.as_ref().is_some_and(Metadata::is_dir) {
             return refuse("it is a folder; name a file in it".into());
         }
-        if existing.as_ref().is_some_and(|m| m.permissions().readonly()) {
-            return refuse("it exists and is read-only; remove it or choose another name".into());
+        // Of such a path the last part would be taken for the name of a file.
+        let name = asked.to_string_lossy();
+        if name.strip_suffix('.').unwrap_or(&name).ends_with(std::path::is_separator) {
+            return refuse("it ends like the name of a folder; name a file".into());
         }
         match fs::metadata(folder(&file)) {
             Ok(m) if m.is_dir() => Ok(Self { asked, file, existing }),
             Ok(_) => refuse(format!("{} is not a folder", folder(&file).display())),
-            Err(e) if e.kind() == std::io::ErrorKind::NotFound => {
+            Err(e) if e.kind() == ErrorKind::NotFound => {
                 refuse(format!("the folder {} does not exist; make it first", folder(&file).display()))
             }
             Err(e) => Err(Error::io("writing", asked)(e)),
@@ -200,7 +215,15 @@ impl<'a> Destination<'a> {
             use std::os::unix::fs::PermissionsExt;
             builder.permissions(fs::Permissions::from_mode(0o666)); // less the umask, as any new file
         }
-        builder.tempfile_in(folder(&self.file)).map_err(Error::io("writing", self.asked))
+        // The error names a file that nobody asked for; its kind says enough.
+        builder.tempfile_in(folder(&self.file)).map_err(|error| match error.kind() {
+            ErrorKind::PermissionDenied => Error::Usage(format!(
+                "writing {}: no file may be made in the folder {}; choose another one, or have it made writable",
+                self.asked.display(),
+                folder(&self.file).display()
+            )),
+            kind => Error::io("writing", self.asked)(kind.into()),
+        })
     }
 
     fn check(&self) -> Result<()> {
@@ -589,6 +612,8 @@ mod tests {
             ("folder.png", "is a folder"),
             ("file/a.png", ""),
             ("locked.png", "read-only"),
+            ("new.png/", "ends like the name of a folder"),
+            ("new.png/.", "ends like the name of a folder"),
         ] {
             let path = folder.path().join(name);
             for error in [check_writable(&path).unwrap_err(), write(&path, &image, None, 0.0).unwrap_err()] {
