@@ -292,6 +292,67 @@ fn errors_end_with_two_and_name_the_cause() {
     );
 }
 
+/// A copy of a scene, which a test may spoil.
+fn copied(name: &str, to: &Path) {
+    std::fs::create_dir(to).expect("a folder");
+    for file in ["scene.obj", "scene.mtl", "camera.json"] {
+        std::fs::copy(Path::new(&scene(name)).join(file), to.join(file)).expect(file);
+    }
+}
+
+#[test]
+fn nothing_overwrites_what_is_read_or_written() {
+    let folder = tempfile::tempdir().expect("a folder");
+    copied("plates", &folder.path().join("cc"));
+    let small = ["--size", "8x8", "-q"];
+    for args in
+        [&["render", "cc", "--spp", "1", "-o", "a.exr"][..], &["map", "cc", "--passes", "1", "-o", "m.map"]]
+    {
+        let done = occlude(&[args, &small].concat(), folder.path());
+        assert_eq!(done.status.code(), Some(0), "{args:?}: {}", text(&done.stderr));
+    }
+    let files = ["cc/scene.obj", "cc/scene.mtl", "cc/camera.json", "a.exr", "m.map"];
+    let read = || files.map(|file| std::fs::read(folder.path().join(file)).expect(file));
+    let before = read();
+    for (args, named) in [
+        (
+            &["render", "cc", "--stats", "cc/scene.obj"][..],
+            ["--stats cc/scene.obj", "cc/scene.obj, which is read"],
+        ),
+        (
+            &["render", "cc", "--stats", "cc/scene.mtl"],
+            ["--stats cc/scene.mtl", "cc/scene.mtl, which is read"],
+        ),
+        (&["render", "cc", "--stats", "cc/camera.json"], ["--stats cc/camera.json", "which is read"]),
+        (
+            &["map", "cc", "-o", "cc/../cc/scene.obj"],
+            ["--output cc/../cc/scene.obj", "the scene's cc/scene.obj"],
+        ),
+        (&["render", "cc", "--map", "m.map", "--stats", "m.map"], ["--stats m.map", "--map m.map"]),
+        (&["render", "cc", "-o", "b.exr", "--stats", "./b.exr"], ["--stats ./b.exr", "--output b.exr"]),
+        (&["render", "cc", "-o", "a.exr", "--reference", "a.exr"], ["--output a.exr", "--reference a.exr"]),
+        (&["compare", "a.exr", "a.exr", "-o", "a.exr"], ["--output a.exr", "the image a.exr"]),
+        (&["render", "cc", "--stats", "new/"], ["writing new/", "name a file"]),
+        (&["map", "cc", "-o", "new/"], ["writing new/", "name a file"]),
+        (&["photons", "cc", "-o", "p.ply/"], ["writing p.ply/", "name a file"]),
+    ] {
+        let scene = args[0] != "compare";
+        let refused = occlude(&[args, if scene { &small[..2] } else { &[] }].concat(), folder.path());
+        let said = text(&refused.stderr);
+        assert_eq!(refused.status.code(), Some(2), "{args:?}: {said}");
+        assert!(named.iter().all(|name| said.contains(name)), "{args:?}: {said}");
+    }
+    assert!(read() == before);
+    // What was made before may be made again.
+    for args in [
+        &["map", "cc", "--passes", "1", "-o", "m.map"][..],
+        &["render", "cc", "--spp", "1", "-o", "a.exr", "--stats", "/dev/null", "-o", "b.exr"],
+    ] {
+        let done = occlude(&[args, &small].concat(), folder.path());
+        assert_eq!(done.status.code(), Some(0), "{args:?}: {}", text(&done.stderr));
+    }
+}
+
 #[cfg(unix)]
 #[test]
 fn statistics_go_down_a_pipe() {

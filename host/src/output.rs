@@ -10,6 +10,7 @@
 //! A file appears whole or not at all: it is written beside its destination under
 //! another name, flushed to the disk, and renamed. A symbolic link is followed, an
 //! existing file keeps its permissions, and a device or pipe is written to directly.
+//! [`check_apart`] keeps a command from writing over what it reads, or writes.
 
 use std::fs::{self, Metadata};
 use std::io::{Cursor, ErrorKind, Write};
@@ -115,6 +116,41 @@ pub fn write_bytes(path: impl AsRef<Path>, bytes: &[u8]) -> Result<()> {
 /// The same as [`check_writable`] for [`write_bytes`], whatever the name ends in.
 pub fn check_writable_bytes(path: impl AsRef<Path>) -> Result<()> {
     Destination::of(path.as_ref())?.check()
+}
+
+/// Refuses an output that would overwrite an input, or another output.
+///
+/// Each has the word that says what it is, like the option that names it, for the message. By whatever way a file is named,
+/// it is the same file. Devices and pipes are no files, and may be named as often as one likes.
+pub fn check_apart(outputs: &[(&str, &Path)], inputs: &[(&str, &Path)]) -> Result<()> {
+    let inputs: Vec<_> = inputs.iter().map(|&(what, path)| (what, path, file_at(path))).collect();
+    let outputs: Vec<_> = outputs.iter().map(|&(what, path)| (what, path, file_at(path))).collect();
+    for (k, (what, path, file)) in outputs.iter().enumerate().filter(|(_, (.., file))| file.is_some()) {
+        let named = format!("{what} {}", path.display());
+        if let Some((input, its, _)) = inputs.iter().find(|(.., read)| read == file) {
+            return Err(Error::Usage(format!(
+                "{named} would overwrite {input} {}, which is read: name another file",
+                its.display()
+            )));
+        }
+        if let Some((other, its, _)) = outputs[..k].iter().find(|(.., written)| written == file) {
+            return Err(Error::Usage(format!(
+                "{named} would overwrite {other} {}: name two files",
+                its.display()
+            )));
+        }
+    }
+    Ok(())
+}
+
+/// The one path of a file that is there or could be made; `None` for what is no file.
+fn file_at(path: &Path) -> Option<PathBuf> {
+    let destination = Destination::of_any(path).ok().filter(|destination| !destination.is_special())?;
+    let file = destination.file;
+    // A folder may have several names, and on some systems a file in any case of its letters.
+    fs::canonicalize(&file)
+        .ok()
+        .or_else(|| Some(fs::canonicalize(folder(&file)).ok()?.join(file.file_name()?)))
 }
 
 /// Reads an image in the format its name ends in, as linear radiance.
@@ -661,5 +697,36 @@ mod tests {
 
         symlink("round.pfm", at("round.pfm")).unwrap();
         assert!(check_writable(at("round.pfm")).is_err());
+    }
+
+    #[cfg(unix)]
+    #[test]
+    fn a_file_is_itself_by_any_name() {
+        use std::os::unix::fs::symlink;
+        let folder = tempfile::tempdir().unwrap();
+        let at = |name: &str| folder.path().join(name);
+        fs::create_dir(at("in")).unwrap();
+        fs::write(at("in/a.map"), "").unwrap();
+        symlink("in", at("also")).unwrap();
+        symlink("a.map", at("in/link")).unwrap();
+        symlink("new.map", at("in/to new")).unwrap();
+        symlink("/dev/null", at("null")).unwrap();
+        let apart = |outputs: &[&str], inputs: &[&str]| {
+            let (outputs, inputs) = (outputs.iter().map(|n| at(n)), inputs.iter().map(|n| at(n)));
+            let (outputs, inputs): (Vec<_>, Vec<_>) = (outputs.collect(), inputs.collect());
+            fn named(paths: &[PathBuf]) -> Vec<(&str, &Path)> {
+                paths.iter().map(|path| ("--it", &**path)).collect()
+            }
+            check_apart(&named(&outputs), &named(&inputs)).map_err(|e| e.to_string())
+        };
+        for name in ["in/a.map", "also/a.map", "in/../also/link"] {
+            let said = apart(&["b", name], &["c", "in/a.map"]).unwrap_err();
+            assert!(said.contains(name) && said.contains("in/a.map, which is read"), "{said}");
+        }
+        for name in ["in/new.map", "also/new.map", "also/to new"] {
+            let said = apart(&["in/new.map", name], &["in/a.map"]).unwrap_err();
+            assert!(said.contains(name) && said.contains("name two files"), "{said}");
+        }
+        apart(&["null", "null", "in/b", "c"], &["null", "in/a.map", "in/a.map", "gone/a"]).unwrap();
     }
 }

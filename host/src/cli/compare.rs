@@ -40,6 +40,7 @@ pub fn run(args: &CompareArgs) -> Result<()> {
 fn report(args: &CompareArgs) -> Result<String> {
     if let Some(path) = &args.output {
         output::check_writable(path)?;
+        output::check_apart(&[("--output", path)], &[("the image", &args.a), ("the reference", &args.b)])?;
     }
     let (test, reference) = (output::read(&args.a)?, output::read(&args.b)?);
     let comparison = compare(&test, &reference)?;

@@ -97,6 +97,7 @@ pub(super) fn run(args: &LearnArgs, level: Level) -> Result<Ended> {
     if !args.quiet {
         scene.warnings.iter().for_each(|warning| note(&format!("warning: {warning}")));
     }
+    output::check_apart(&[("--output", path)], &super::files_of(&scene))?;
     let camera = scene.camera.ok_or_else(|| Error::input(&args.input, "has no camera"))?;
     let accel = Accel::build(&scene, args.quality);
     let lights = light::lights(&scene);

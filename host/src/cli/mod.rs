@@ -11,9 +11,11 @@ pub mod render;
 pub mod reproduce;
 
 use crate::error::{Error, Result};
+use crate::scene::Scene;
 use clap::{Parser, Subcommand};
 use occlude_kernel::lanes::{Level, detect, level_name, level_named, levels};
 use std::io::Write;
+use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
 use std::sync::atomic::{AtomicBool, Ordering};
@@ -108,6 +110,11 @@ pub fn interruptible(what: &str) -> Arc<AtomicBool> {
         note(&format!("warning: Ctrl-C will lose {what}: {error}"));
     }
     stop
+}
+
+/// The files that a scene was read from, for `output::check_apart`.
+fn files_of(scene: &Scene) -> Vec<(&'static str, &Path)> {
+    scene.files.iter().map(|file| ("the scene's", &**file)).collect()
 }
 
 /// Prints to standard output. A reader that has gone away is no error: `occlude info | head`.

@@ -79,6 +79,7 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     }
     let scene = scene::load(&args.scene, &args.camera.request())?;
     scene.warnings.iter().for_each(|warning| note(&format!("warning: {warning}")));
+    output::check_apart(&[("--output", &args.output)], &super::files_of(&scene))?;
     let camera = scene.camera.ok_or_else(|| Error::input(&args.scene, "has no camera"))?;
     let (width, height) = (camera.width, camera.height);
     let accel = Accel::build(&scene, args.quality);

@@ -400,6 +400,12 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     for path in &outputs {
         output::check_writable(path)?;
     }
+    let mut written: Vec<_> = outputs.iter().map(|path| ("--output", &**path)).collect();
+    written.extend(args.stats.as_deref().map(|path| ("--stats", path)));
+    let mut read = super::files_of(&scene);
+    read.extend(args.auto.file.as_deref().map(|path| ("--map", path)));
+    read.extend(args.reference.as_deref().map(|path| ("--reference", path)));
+    output::check_apart(&written, &read)?;
 
     let start = Instant::now();
     let accel = Accel::build(&scene, args.quality);

@@ -220,6 +220,11 @@ pub(super) struct Draft {
 }
 
 impl Draft {
+    /// The camera file, if there is one.
+    pub(super) fn file(&self) -> Option<&Path> {
+        self.file.as_deref()
+    }
+
     /// Takes over the keys of a camera file. Only a key that an option replaces may be missing.
     fn fill(&mut self, path: &Path, text: &[u8]) -> Result<()> {
         let text = text.strip_prefix(b"\xef\xbb\xbf").unwrap_or(text);

@@ -60,6 +60,8 @@ pub struct Scene {
     pub camera: Option<Camera>,
     /// What was odd but usable, a sentence each.
     pub warnings: Vec<String>,
+    /// The files it was read from.
+    pub files: Vec<PathBuf>,
 }
 
 impl Scene {
@@ -126,6 +128,8 @@ pub fn load(path: &Path, camera: &CameraRequest) -> Result<Scene> {
         _ => return Err(Error::input(&file, "scenes are read from .obj files; give one, or its folder")),
     };
     scene.name = name_of(path);
+    scene.files.push(file);
+    scene.files.extend(draft.file().map(Path::to_owned));
     if let Some(bounds) = scene.bounds() {
         scene.camera = Some(draft.complete(bounds, &mut scene.warnings)?);
     }
@@ -199,6 +203,7 @@ mod tests {
         let scene = load(both.path(), &CameraRequest::default()).unwrap();
         assert_eq!(scene.name, both.path().file_name().unwrap().to_str().unwrap());
         assert_eq!(scene.bounds(), Some((Vec3::ZERO, Vec3::new(1.0, 2.0, 0.0))));
+        assert_eq!(scene.files, ["a.mtl", "scene.obj"].map(|name| both.path().join(name)));
         scene.camera.unwrap().check().unwrap();
         let scene = load(&both.path().join("other.OBJ"), &CameraRequest::default()).unwrap();
         assert_eq!(scene.name, "other");

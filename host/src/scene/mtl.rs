@@ -106,6 +106,11 @@ impl Library {
         self.names.values().any(|&m| self.materials[m as usize].emission != Vec3::ZERO)
     }
 
+    /// The files read.
+    pub(super) fn files(&self) -> &[PathBuf] {
+        &self.files
+    }
+
     /// The files read, by name.
     pub(super) fn file_names(&self) -> String {
         let name = |p: &PathBuf| p.file_name().unwrap_or(p.as_os_str()).to_string_lossy().into_owned();

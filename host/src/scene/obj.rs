@@ -463,6 +463,7 @@ fn finish(mut checked: Checked, mut scene: Scene, degenerate: u64, guessed: u64)
     let emits = checked.library.has_light();
     let files = checked.library.file_names();
     scene.materials = std::mem::take(&mut checked.library.materials);
+    scene.files = checked.library.files().to_vec();
     if !scene.has_light() {
         let mend = match files.as_str() {
             "" => "name a material file with mtllib and give one of its materials a Ke line".to_owned(),
