@@ -1,5 +1,6 @@
 //! What failed, in which file, and what would mend it.
 
+use std::io::ErrorKind;
 use std::path::{Path, PathBuf};
 
 /// The one error of the host. Every message says what was being done, to which file, and how to mend it.
@@ -17,7 +18,7 @@ pub enum Error {
         message: String,
     },
     /// The operating system refused a file.
-    #[error("{doing} {}: {source}", path.display())]
+    #[error("{doing} {}: {}", path.display(), reason(source))]
     Io {
         /// What was being done: "reading", "writing" ….
         doing: &'static str,
@@ -29,6 +30,17 @@ pub enum Error {
     /// The request itself makes no sense.
     #[error("{0}")]
     Usage(String),
+}
+
+/// Why the system refused a file, and the mend where there is one.
+fn reason(error: &std::io::Error) -> String {
+    match error.kind() {
+        ErrorKind::NotFound => "there is no such file or folder; mend the name".to_owned(),
+        ErrorKind::PermissionDenied => "permission denied; allow it, or choose another file".to_owned(),
+        ErrorKind::NotADirectory => "a part of the path is no folder; mend the name".to_owned(),
+        ErrorKind::IsADirectory => "it is a folder; name a file in it".to_owned(),
+        _ => error.to_string(),
+    }
 }
 
 /// What the host's functions return.
