@@ -386,7 +386,7 @@ fn what_is_generated_renders() {
 fn interrupting_keeps_what_there_is() {
     let folder = tempfile::tempdir().expect("a folder");
     let child = Command::new(PROGRAM)
-        .args(["render", &scene("columns"), "-o", "a.png", "--spp", "100000"])
+        .args(["render", &scene("columns"), "-o", "a.png", "--spp", "100000", "--size", "96x54"])
         .current_dir(folder.path())
         .stderr(std::process::Stdio::piped())
         .spawn()
@@ -399,6 +399,38 @@ fn interrupting_keeps_what_there_is() {
     assert_eq!(done.status.code(), Some(1), "{said}");
     assert!(said.contains("interrupted after"), "{said}");
     assert!(folder.path().join("a.png").exists());
+}
+
+/// What an earlier run wrote is better than nothing.
+#[cfg(unix)]
+#[test]
+fn interrupting_the_first_pass_writes_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::write(folder.path().join("kept"), "good").expect("a file");
+    std::os::unix::fs::symlink("kept", folder.path().join("a.exr")).expect("a link");
+    let columns = scene("columns");
+    for args in [
+        &["render", &columns, "--method", "exact", "-o", "a.exr", "--stats", "s.json", "--spp", "9"][..],
+        &["map", &columns, "-o", "kept"],
+    ] {
+        // So many that no pass ends in time, and tiles of 256 pixels do.
+        let long = ["--size", "1600x900", "--shadow-rays", "256", "--threads", "1"];
+        let child = Command::new(PROGRAM)
+            .args([args, &long].concat())
+            .current_dir(folder.path())
+            .stderr(std::process::Stdio::piped())
+            .spawn()
+            .expect("it starts");
+        std::thread::sleep(std::time::Duration::from_millis(1500));
+        let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+        assert!(killed.success());
+        let done = child.wait_with_output().expect("it ends");
+        let said = text(&done.stderr);
+        assert_eq!(done.status.code(), Some(1), "{said}");
+        assert!(said.contains("nothing was written"), "{said}");
+        assert_eq!(std::fs::read(folder.path().join("kept")).expect("the file"), b"good");
+        assert_eq!(std::fs::read_dir(folder.path()).expect("the folder").count(), 2);
+    }
 }
 
 /// Is a word anywhere in a page, but in the letters that pictures are written in?

@@ -123,6 +123,9 @@ pub(super) fn run(args: &LearnArgs, level: Level) -> Result<Ended> {
             note(&format!("pass {pass} of {}", args.passes));
         }
     })?;
+    if rendered.passes == 0 {
+        return Ok(super::interrupted_before_the_first_pass(args.quiet));
+    }
     let saved = auto.save(&stage);
     saved.write(path)?;
     if !args.quiet {

@@ -68,7 +68,7 @@ fn simd_level(name: &str) -> std::result::Result<SimdLevel, String> {
 pub enum Ended {
     /// As asked.
     Done,
-    /// By Ctrl-C; what there was has been written.
+    /// By Ctrl-C; what there was, if a pass was done, has been written.
     Interrupted,
 }
 
@@ -110,6 +110,14 @@ pub fn interruptible(what: &str) -> Arc<AtomicBool> {
         note(&format!("warning: Ctrl-C will lose {what}: {error}"));
     }
     stop
+}
+
+/// Ends a command that has nothing to write: what an earlier one wrote is better.
+fn interrupted_before_the_first_pass(quiet: bool) -> Ended {
+    if !quiet {
+        note("interrupted before the first pass was done; nothing was written");
+    }
+    Ended::Interrupted
 }
 
 /// The files that a scene was read from, for `output::check_apart`.

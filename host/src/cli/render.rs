@@ -485,6 +485,9 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         render(&stage, method, size, limits, args.threads.into(), &stop, passed)?
     };
     progress.finish();
+    if rendered.passes == 0 {
+        return Ok(super::interrupted_before_the_first_pass(args.quiet));
+    }
 
     let mut image = rendered.film.develop();
     // Estimates are averaged as they are; the picture that is written holds light.
