@@ -32,13 +32,15 @@ const LEAST_PIXELS: usize = 16;
 
 /// Everything [`compare`] finds, in linear radiance. `test` is on trial, `reference` is the truth.
 ///
-/// Pixels of the test that are not finite are counted, and then taken for equal to the reference.
+/// Pixels of the test that are not finite are counted, and left out of everything else, as they are of the reference.
 #[derive(Clone, Debug, PartialEq, Serialize)]
 pub struct Comparison {
     /// Pixels across.
     pub width: u32,
     /// Pixels down.
     pub height: u32,
+    /// Pixels that all figures are over: those where the test is finite.
+    pub compared: usize,
     /// Pixels of the test with a NaN.
     pub nan: usize,
     /// Pixels of the test with an infinity.
@@ -107,7 +109,7 @@ impl Comparison {
     }
 }
 
-/// Compares an image with a reference of the same size, whose pixels have to be finite.
+/// Compares an image with a reference of the same size, whose pixels have to be finite, and one of the image's at least.
 ///
 /// Takes one pass for the means and one for everything else, and sorts one number per pixel.
 pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
@@ -116,9 +118,16 @@ pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
     if bad > 0 {
         return Err(Error::Usage(format!("the reference has {bad} pixels that are not finite numbers")));
     }
+    let compared = test.pixels.iter().filter(|p| p.iter().all(|v| v.is_finite())).count();
+    if compared == 0 {
+        return Err(Error::Usage(
+            "the image has no pixel of finite numbers, so there is nothing to compare; render it again"
+                .into(),
+        ));
+    }
     let count = |pred: fn(&f32) -> bool| test.pixels.iter().filter(|p| p.iter().any(pred)).count();
     let both = Both { test, reference };
-    let n = reference.pixels.len() as f64;
+    let n = compared as f64;
 
     let sums = both.sum_rows(|t, r| [t[0], t[1], t[2], r[0], r[1], r[2]]);
     let [mean_test, mean_reference] = [0, 3].map(|first| [0, 1, 2].map(|c| sums[first + c] / n));
@@ -143,10 +152,8 @@ pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
 
     let mut sorted: Vec<f64> = (0..reference.pixels.len())
         .into_par_iter()
-        .map(|i| {
-            let (t, r) = both.pixel(i);
-            relative(sub(t, r), r)
-        })
+        .filter_map(|i| both.pixel(i))
+        .map(|(t, r)| relative(sub(t, r), r))
         .collect();
     sorted.par_sort_unstable_by(f64::total_cmp);
     sorted.truncate(((n * 0.999) as usize).max(1));
@@ -156,6 +163,7 @@ pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
     Ok(Comparison {
         width: test.width,
         height: test.height,
+        compared,
         nan: count(|v| v.is_nan()),
         infinite: count(|v| v.is_infinite()),
         negative: count(|v| *v < 0.0),
@@ -204,11 +212,11 @@ struct Both<'a> {
 }
 
 impl Both<'_> {
-    /// Test and reference; twice the reference where the test is not finite.
-    fn pixel(&self, i: usize) -> ([f64; 3], [f64; 3]) {
+    /// Test and reference; `None` where the test is not finite.
+    fn pixel(&self, i: usize) -> Option<([f64; 3], [f64; 3])> {
         let r = self.reference.pixels[i].map(f64::from);
         let t = self.test.pixels[i].map(f64::from);
-        (if t.iter().all(|v| v.is_finite()) { t } else { r }, r)
+        t.iter().all(|v| v.is_finite()).then_some((t, r))
     }
 
     /// Sums over all pixels: rows in parallel, then the rows from top to bottom.
@@ -218,7 +226,7 @@ impl Both<'_> {
         let rows: Vec<[f64; N]> = (0..self.test.height as usize)
             .into_par_iter()
             .map(|y| {
-                let row = (y * width..(y + 1) * width).map(|i| self.pixel(i));
+                let row = (y * width..(y + 1) * width).filter_map(|i| self.pixel(i));
                 row.fold([0.0; N], |sum, (t, r)| add(sum, value(t, r)))
             })
             .collect();
@@ -236,7 +244,7 @@ impl Both<'_> {
                     let x = column * BLOCK;
                     let pixels: Vec<_> = (y..height.min(y + BLOCK))
                         .flat_map(|y| (x..width.min(x + BLOCK)).map(move |x| (x, y)))
-                        .map(|(x, y)| self.pixel(y as usize * width as usize + x as usize))
+                        .filter_map(|(x, y)| self.pixel(y as usize * width as usize + x as usize))
                         .collect();
                     (0..3).filter_map(move |channel| block(x, y, channel, &pixels, mean))
                 });
@@ -336,8 +344,15 @@ mod tests {
         test.pixels[4] = [f32::INFINITY, f32::NAN, 0.0];
         test.pixels[5][2] = -1.0;
         let c = compare(&test, &reference()).unwrap();
-        assert_eq!((c.nan, c.infinite, c.negative), (2, 1, 1));
-        assert!(near(c.rmse, (4.0 / (3.0 * 40.0 * 33.0f64)).sqrt()));
+        assert_eq!((c.nan, c.infinite, c.negative, c.compared), (2, 1, 1, 40 * 33 - 2));
+        assert!(near(c.rmse, (4.0 / (3.0 * (40.0 * 33.0 - 2.0f64))).sqrt()));
+
+        // Half of it: the other half says what both would.
+        let mut half = reference();
+        half.pixels.iter_mut().for_each(|p| p[1] += 0.25);
+        half.pixels[..20 * 33].iter_mut().for_each(|p| p[1] = f32::NAN);
+        let c = compare(&half, &reference()).unwrap();
+        assert!(near(c.rmse, 0.25 / 3f64.sqrt()) && near(c.mean_test[1] - c.mean_reference[1], 0.25));
     }
 
     #[test]
@@ -348,6 +363,10 @@ mod tests {
         let mut nan = reference();
         nan.pixels[0][0] = f32::NAN;
         assert!(compare(&reference(), &nan).is_err());
+        for bad in [f32::NAN, f32::INFINITY] {
+            let test = Image::from_fn(40, 33, |_, _| [1.0, bad, 1.0]);
+            assert!(compare(&test, &reference()).unwrap_err().to_string().contains("nothing to compare"));
+        }
     }
 
     #[test]

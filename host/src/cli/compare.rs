@@ -156,6 +156,11 @@ fn table(args: &CompareArgs, c: &Comparison, flip: f64, scale: Option<f32>) -> S
         ),
     );
     line("bad pixels", format!("{} NaN, {} infinite, {} negative", c.nan, c.infinite, c.negative));
+    let pixels = c.width as usize * c.height as usize;
+    if c.compared < pixels {
+        let what = "those that are not finite are left out of all figures, and black or white to FLIP";
+        line("compared", format!("{} of {pixels} pixels: {what}", c.compared));
+    }
     if let Some(path) = &args.output {
         let legend = scale.map(|s| format!("   full red +{0}, full blue -{0}", number(s.into())));
         line("difference", format!("{}{}", path.display(), legend.unwrap_or_default()));
@@ -305,6 +310,15 @@ mod tests {
         assert_eq!(json["worst"]["bias"].as_f64().map(|v| v as f32), Some(0.375));
         assert!(json["flip"]["mean"].as_f64().unwrap() > 0.0);
         assert_eq!(output::read(path("d.exr")).unwrap().pixels[0], [-0.5, 0.0, 0.0]);
+
+        let mut spoilt = image.clone();
+        spoilt.pixels[7][1] = f32::NAN;
+        output::write(path("spoilt.pfm"), &spoilt, None, 0.0).unwrap();
+        let table = report(&args(&[&path("spoilt.pfm"), &path("b.pfm")])).unwrap();
+        assert!(table.contains("compared     339 of 340 pixels: "), "{table}");
+        spoilt.pixels.fill([f32::NAN; 3]);
+        output::write(path("nan.pfm"), &spoilt, None, 0.0).unwrap();
+        assert!(report(&args(&[&path("nan.pfm"), &path("b.pfm")])).is_err());
 
         assert!(report(&args(&[&path("a.exr"), &path("small.pfm")])).is_err());
         assert!(report(&args(&[&path("a.exr"), &path("missing.exr")])).is_err());
