@@ -13,6 +13,7 @@ use crate::output;
 
 /// Compare an image with a reference: error, bias and what the eye sees of it.
 #[derive(Clone, Debug, clap::Args)]
+#[command(allow_negative_numbers = true)]
 pub struct CompareArgs {
     /// The image on trial (.exr, .hdr, .pfm, .png)
     #[arg(value_name = "TEST")]
@@ -25,7 +26,7 @@ pub struct CompareArgs {
     #[arg(short, long, value_name = "DIFF.png")]
     pub output: Option<PathBuf>,
     /// Exposure at which FLIP looks at the images, in stops
-    #[arg(long, value_name = "EV", default_value_t = 0.0, allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long, value_name = "EV", default_value_t = 0.0, value_parser = finite)]
     pub exposure: f32,
     /// Print JSON instead of a table
     #[arg(long)]

@@ -2,7 +2,7 @@
 
 use super::render::CameraArgs;
 use super::reproduce::{Progress, write};
-use super::{Ended, note};
+use super::{Ended, note, whole};
 use crate::accel::{Accel, Quality};
 use crate::compare_methods::{Comparison, FILES, MAKER, Method, compare_methods};
 use crate::error::{Error, Result};
@@ -18,6 +18,7 @@ use std::path::PathBuf;
 
 /// Arguments of `occlude compare-methods`.
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 pub(super) struct CompareMethodsArgs {
     /// The scene: a folder with one .obj, or an .obj.
     scene: PathBuf,
@@ -31,15 +32,15 @@ pub(super) struct CompareMethodsArgs {
     output: PathBuf,
 
     /// Passes: camera samples a pixel.
-    #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, default_value_t = 16, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
     spp: u32,
 
     /// Shadow rays a camera sample, over all lights together.
-    #[arg(long, default_value_t = 64, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, default_value_t = 64, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
     shadow_rays: u32,
 
     /// Shadow rays of the reference.
-    #[arg(long, default_value_t = 1024, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, default_value_t = 1024, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
     reference_rays: u32,
 
     /// How long to look for a good tree.
@@ -47,11 +48,11 @@ pub(super) struct CompareMethodsArgs {
     quality: Quality,
 
     /// Threads; 0 for one a core. All but the times is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = whole::<u16>(0..=1024))]
     threads: u16,
 
     /// Seed of the random numbers.
-    #[arg(long, default_value_t = 0, value_name = "S")]
+    #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
     /// Write to the folder whatever is in it.

@@ -1,5 +1,6 @@
 //! `occlude generate`: a scene of any size, for measuring.
 
+use super::{number, whole};
 use crate::error::Result;
 use crate::generate::{self, Kind, MOST_TRIANGLES};
 use std::io::{self, Write};
@@ -7,6 +8,7 @@ use std::path::PathBuf;
 
 /// Generate a scene of a given number of triangles
 #[derive(Clone, Debug, clap::Args)]
+#[command(allow_negative_numbers = true)]
 pub struct GenerateArgs {
     /// What to generate
     #[arg(value_name = "KIND")]
@@ -18,7 +20,7 @@ pub struct GenerateArgs {
     #[arg(short, long, value_name = "N", default_value = "100k", value_parser = count)]
     pub triangles: usize,
     /// The same seed gives the same scene, on any machine
-    #[arg(long, value_name = "S", default_value_t = 0)]
+    #[arg(long, value_name = "S", default_value_t = 0, value_parser = whole::<u64>(0..=u64::MAX))]
     pub seed: u64,
     /// Replace a scene that is already in the folder
     #[arg(long)]
@@ -48,14 +50,7 @@ pub fn run(args: &GenerateArgs) -> Result<()> {
 
 /// A count of triangles, as people write it: `1000000`, `1_000_000`, `1e6`, `250k`, `1.5M`.
 fn count(text: &str) -> std::result::Result<usize, String> {
-    let digits = text.replace('_', "");
-    let (digits, unit) = match digits.char_indices().next_back() {
-        Some((end, 'k' | 'K')) => (&digits[..end], 1e3),
-        Some((end, 'm' | 'M')) => (&digits[..end], 1e6),
-        _ => (digits.as_str(), 1.0),
-    };
-    let number = digits.parse::<f64>().ok().filter(|_| digits.starts_with(|c: char| c.is_ascii_digit()));
-    match number.map(|n| (n * unit).round()) {
+    match number(text).map(f64::round) {
         Some(n) if n >= 1.0 && n <= MOST_TRIANGLES as f64 => Ok(n as usize),
         Some(_) => Err(format!("between 1 and {MOST_TRIANGLES} triangles are possible")),
         None => Err("a number such as 1000000, 1_000_000, 1e6, 250k or 2M is needed".to_owned()),

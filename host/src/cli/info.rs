@@ -15,6 +15,7 @@ use std::time::Instant;
 
 /// Arguments of `occlude info`.
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 pub struct InfoArgs {
     /// A folder with scene.obj, or an .obj file. Without it, only the machine.
     scene: Option<PathBuf>,

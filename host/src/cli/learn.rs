@@ -1,7 +1,7 @@
 //! `occlude map`: what `--method auto` learns, kept in a file.
 
 use super::render::CameraArgs;
-use super::{Ended, note, print};
+use super::{Ended, note, print, whole};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{Auto, AutoOptions, SavedMap, Stage};
@@ -14,6 +14,7 @@ use std::path::PathBuf;
 
 /// Arguments of `occlude map`.
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 pub(super) struct LearnArgs {
     /// The scene to learn: a folder with one .obj, or an .obj. Without -o, a map to look into.
     input: PathBuf,
@@ -27,15 +28,15 @@ pub(super) struct LearnArgs {
     inspect: bool,
 
     /// Passes to learn from.
-    #[arg(long, default_value_t = 8, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=1_000_000))]
+    #[arg(long, default_value_t = 8, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
     passes: u32,
 
     /// Shadow rays a camera sample, over all lights together.
-    #[arg(long, default_value_t = 64, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    #[arg(long, default_value_t = 64, value_name = "N", value_parser = whole::<u32>(1..=65536))]
     shadow_rays: u32,
 
     /// Bytes that the map may take, like 64M [default: 256M].
-    #[arg(long, value_name = "BYTES", value_parser = memory)]
+    #[arg(long, value_name = "BYTES", allow_hyphen_values = true, value_parser = memory)]
     map_memory: Option<usize>,
 
     /// How long to look for a good tree.
@@ -43,11 +44,11 @@ pub(super) struct LearnArgs {
     quality: Quality,
 
     /// Threads; 0 for one a core. The map is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = whole::<u16>(0..=1024))]
     threads: u16,
 
     /// Seed of the random numbers.
-    #[arg(long, default_value_t = 0, value_name = "S")]
+    #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
     /// Print nothing but errors.

@@ -1,5 +1,6 @@
 //! The options of the occlusion map, which several commands share.
 
+use super::whole;
 use crate::accel::Quality;
 use crate::error::{Error, Result};
 use crate::integrator::{MapOptions, PreparedMap, Stage};
@@ -14,16 +15,16 @@ use clap::Args;
 #[command(next_help_heading = "Occlusion map (--method map, or stochastic --blockers map)")]
 pub struct MapArgs {
     /// Photons to shoot: lines from the lights [default: four a triangle, 250 000 to 4 000 000].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u64).range(1..=100_000_000))]
+    #[arg(long, value_name = "N", value_parser = whole::<u64>(1..=100_000_000))]
     photons: Option<u64>,
 
     /// Rounds to shoot them in. 1 shoots evenly; of more, the first half is even, and the rest goes where photons saw
     /// shadows begin and end, or blockers that few of them named [default: 1].
-    #[arg(long, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=64))]
+    #[arg(long, value_name = "N", value_parser = whole::<u32>(1..=64))]
     photon_rounds: Option<u32>,
 
     /// Photons to look up around a point [default: 50].
-    #[arg(long, value_name = "K", value_parser = clap::value_parser!(u32).range(1..=100_000))]
+    #[arg(long, value_name = "K", value_parser = whole::<u32>(1..=100_000))]
     photon_k: Option<u32>,
 
     /// How far to look for them [default: three times as far as those of the even round are on average].

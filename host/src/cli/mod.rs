@@ -15,6 +15,7 @@ use crate::scene::Scene;
 use clap::{Parser, Subcommand};
 use occlude_kernel::lanes::{Level, detect, level_name, level_named, levels};
 use std::io::Write;
+use std::ops::RangeInclusive;
 use std::path::Path;
 use std::process::ExitCode;
 use std::sync::Arc;
@@ -112,6 +113,32 @@ pub fn interruptible(what: &str) -> Arc<AtomicBool> {
     stop
 }
 
+/// A number as people write it: `1000000`, `1_000_000`, `1e6`, `250k`, `1.5M`. Not below 0.
+fn number(text: &str) -> Option<f64> {
+    let digits = text.replace('_', "");
+    let (digits, unit) = match digits.char_indices().next_back() {
+        Some((end, 'k' | 'K')) => (&digits[..end], 1e3),
+        Some((end, 'm' | 'M')) => (&digits[..end], 1e6),
+        _ => (digits.as_str(), 1.0),
+    };
+    digits.starts_with(|c: char| c.is_ascii_digit()).then(|| Some(digits.parse::<f64>().ok()? * unit))?
+}
+
+/// A parser of whole numbers in a range, written like those of [`number`].
+fn whole<T: TryFrom<u64>>(
+    range: RangeInclusive<u64>,
+) -> impl Fn(&str) -> std::result::Result<T, String> + Clone + Send + Sync + 'static {
+    move |text| {
+        // All digits of a seed count, and a float has not so many. 2.3M is off by rounding only.
+        let rounded = || number(text).filter(|n| (n - n.round()).abs() < 1e-6 && *n < u64::MAX as f64);
+        let value = text.parse().ok().or_else(|| Some(rounded()?.round() as u64));
+        let value = value.filter(|value| range.contains(value)).and_then(|value| T::try_from(value).ok());
+        value.ok_or_else(|| {
+            format!("wants a whole number from {} to {}, like 1000 or 2.5k", range.start(), range.end())
+        })
+    }
+}
+
 /// Ends a command that has nothing to write: what an earlier one wrote is better.
 fn interrupted_before_the_first_pass(quiet: bool) -> Ended {
     if !quiet {
@@ -139,4 +166,27 @@ pub fn print(text: &str) -> Result<()> {
 /// Prints a line to standard error, if anybody listens.
 pub fn note(text: &str) {
     let _ = writeln!(std::io::stderr(), "{text}");
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn whole_numbers_as_people_write_them() {
+        let small = whole::<u32>(1..=2_300_000);
+        for (text, value) in
+            [("1", 1), ("1e5", 100_000), ("100k", 100_000), ("2.3M", 2_300_000), ("1_000", 1000)]
+        {
+            assert_eq!(small(text), Ok(value), "{text}");
+        }
+        for wrong in ["0", "2300001", "-1", "1.5", "", "k", "nan", "1e99", "many", "0x10"] {
+            assert!(small(wrong).unwrap_err().contains("from 1 to 2300000"), "{wrong}");
+        }
+        let seed = whole::<u64>(0..=u64::MAX);
+        assert_eq!(seed("18446744073709551615"), Ok(u64::MAX));
+        assert_eq!(seed("9007199254740993"), Ok(9_007_199_254_740_993));
+        assert!(seed("18446744073709551616").is_err());
+        assert!(whole::<u16>(0..=u64::MAX)("70000").is_err());
+    }
 }

@@ -1,8 +1,8 @@
 //! `occlude photons`: shows the occlusion map.
 
 use super::map::{self, MapArgs};
-use super::note;
 use super::render::CameraArgs;
+use super::{note, whole};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::film::{Image, Tile};
@@ -20,6 +20,7 @@ use std::sync::atomic::AtomicBool;
 
 /// Arguments of `occlude photons`.
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 pub struct PhotonsArgs {
     /// A folder with scene.obj (or exactly one .obj), or an .obj file.
     scene: PathBuf,
@@ -33,7 +34,7 @@ pub struct PhotonsArgs {
     show: Show,
 
     /// Photons drawn or written at most; of more, evenly spread ones.
-    #[arg(long, default_value_t = 200_000, value_name = "N", value_parser = clap::value_parser!(u64).range(1..))]
+    #[arg(long, default_value_t = 200_000, value_name = "N", value_parser = whole::<u64>(1..=u64::MAX))]
     most: u64,
 
     /// How long to look for a good tree.
@@ -41,11 +42,11 @@ pub struct PhotonsArgs {
     quality: Quality,
 
     /// Threads; 0 for one a core. The result is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(0..=1024))]
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = whole::<u16>(0..=1024))]
     threads: u16,
 
     /// Seed of the random numbers.
-    #[arg(long, default_value_t = 0, value_name = "S")]
+    #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
     #[command(flatten)]

@@ -1,7 +1,7 @@
 //! `occlude render`.
 
 use super::map::{self, MapArgs};
-use super::{Ended, learn, note};
+use super::{Ended, learn, note, whole};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{
@@ -25,6 +25,7 @@ use std::time::{Duration, Instant};
 
 /// Arguments of `occlude render`.
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 pub struct RenderArgs {
     /// A folder with scene.obj (or exactly one .obj), or an .obj file.
     scene: PathBuf,
@@ -35,12 +36,12 @@ pub struct RenderArgs {
     output: Vec<PathBuf>,
 
     /// Camera samples a pixel, one a pass.
-    #[arg(long, default_value_t = 16, value_name = "P", value_parser = clap::value_parser!(u32).range(1..))]
+    #[arg(long, default_value_t = 16, value_name = "P", value_parser = whole::<u32>(1..=u64::from(u32::MAX)))]
     spp: u32,
 
     /// Shadow rays a camera sample, over all lights together; with --method auto about so many on average, and with
     /// --adaptive on so many at most.
-    #[arg(long, default_value_t = 16, value_name = "N", value_parser = clap::value_parser!(u32).range(1..=65536))]
+    #[arg(long, default_value_t = 16, value_name = "N", value_parser = whole::<u32>(1..=65536))]
     shadow_rays: u32,
 
     /// How visibility is found.
@@ -67,11 +68,11 @@ pub struct RenderArgs {
     quality: Quality,
 
     /// Threads; 0 for one a core. The image is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = whole::<u16>(0..=1024))]
     threads: u16,
 
     /// Seed of the random numbers.
-    #[arg(long, default_value_t = 0, value_name = "S")]
+    #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
     /// Begin no pass after this many seconds of rendering.
@@ -79,7 +80,7 @@ pub struct RenderArgs {
     time_limit: Option<Duration>,
 
     /// Brightness of .png files, in stops.
-    #[arg(long, default_value_t = 0.0, value_name = "EV", allow_negative_numbers = true, value_parser = finite)]
+    #[arg(long, default_value_t = 0.0, value_name = "EV", value_parser = finite)]
     exposure: f32,
 
     /// Compare the result with this image (.exr, .hdr or .pfm).
@@ -116,7 +117,7 @@ struct AutoArgs {
     file: Option<PathBuf>,
 
     /// Bytes that the map may take, like 64M [default: 256M].
-    #[arg(long, value_name = "BYTES", value_parser = learn::memory)]
+    #[arg(long, value_name = "BYTES", allow_hyphen_values = true, value_parser = learn::memory)]
     map_memory: Option<usize>,
 }
 
@@ -147,7 +148,7 @@ struct StochasticArgs {
 
     /// How many groups; more than 2 with --decomposition residual, which asks the later ones the more rarely
     /// [default: 2].
-    #[arg(long, value_name = "K")]
+    #[arg(long, value_name = "K", value_parser = whole::<usize>(0..=u64::from(u32::MAX)))]
     levels: Option<usize>,
 
     /// Of the shadow rays of a point and light, exactly the right share takes each term.
@@ -222,7 +223,7 @@ impl StochasticArgs {
 #[command(next_help_heading = "Camera")]
 pub struct CameraArgs {
     /// Image size in pixels.
-    #[arg(long, value_name = "WxH", value_parser = size)]
+    #[arg(long, value_name = "WxH", allow_hyphen_values = true, value_parser = size)]
     size: Option<(u32, u32)>,
 
     /// A camera file, and not the camera.json beside the scene.

@@ -1,6 +1,6 @@
 //! `occlude reproduce`: tables and figures, run again.
 
-use super::{Ended, note};
+use super::{Ended, note, whole};
 use crate::error::Result;
 use crate::page::{Folder, INDEX};
 use crate::reproduce::map::{self, map};
@@ -35,6 +35,7 @@ enum What {
 }
 
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 struct MapPageArgs {
     /// The folder to write index.html and the .csv files to.
     #[arg(short, long, value_name = "FOLDER", default_value = "map")]
@@ -49,6 +50,7 @@ struct MapPageArgs {
 }
 
 #[derive(Debug, Args)]
+#[command(allow_negative_numbers = true)]
 struct TheoryArgs {
     /// The folder to write index.html and the .csv files to.
     #[arg(short, long, value_name = "FOLDER", default_value = "theory")]
@@ -66,11 +68,11 @@ struct CommonArgs {
     quick: bool,
 
     /// Threads; 0 for one a core. All but the times is the same for any number.
-    #[arg(long, default_value_t = 0, value_name = "T", value_parser = clap::value_parser!(u16).range(..=1024))]
+    #[arg(long, default_value_t = 0, value_name = "T", value_parser = whole::<u16>(0..=1024))]
     threads: u16,
 
     /// Seed of the random numbers.
-    #[arg(long, default_value_t = 0, value_name = "S")]
+    #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
     /// Write to the folder whatever is in it.
