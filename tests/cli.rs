@@ -46,8 +46,9 @@ fn renders_writes_and_reports() {
     let done = occlude(&args, folder.path());
     assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
     assert!(done.stdout.is_empty(), "{}", text(&done.stdout));
-    // In a pipe a line a pass.
-    assert_eq!(text(&done.stderr).lines().filter(|line| line.starts_with("pass ")).count(), 3);
+    // In a pipe a line a second, and the last.
+    let said = text(&done.stderr);
+    assert!(said.contains("pass 3 of 3, "), "{said}");
     for file in ["a.png", "a.exr", "a.pfm", "a.hdr"] {
         assert!(folder.path().join(file).metadata().expect(file).len() > 100);
     }
@@ -144,6 +145,19 @@ fn boxes_in_columns_change_no_bit() {
     assert_eq!(with_stats["volumes"]["boxes"], 25);
     assert!(with_stats["volumes"]["fraction"].as_f64() > Some(0.9));
     assert!(without_stats["volumes"].is_null());
+}
+
+#[test]
+fn a_pipe_hears_of_passes_once_a_second() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let args =
+        ["render", &scene("plates"), "-o", "a.pfm", "--size", "4x4", "--spp", "400", "--method", "exact"];
+    let start = std::time::Instant::now();
+    let done = occlude(&args, folder.path());
+    let seconds = start.elapsed().as_secs_f64();
+    let said = text(&done.stderr);
+    let lines = said.lines().filter(|line| line.starts_with("pass ")).count();
+    assert!(said.contains("pass 400 of 400, ") && lines as f64 <= seconds + 1.0, "{seconds} s: {said}");
 }
 
 #[test]

@@ -1,6 +1,6 @@
 //! `occlude map`: what `--method auto` learns, kept in a file.
 
-use super::render::CameraArgs;
+use super::render::{CameraArgs, Progress};
 use super::{Ended, note, print, whole};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
@@ -119,11 +119,10 @@ pub(super) fn run(args: &LearnArgs, level: Level) -> Result<Ended> {
     let stop = super::interruptible("the map");
     let limits = Limits { passes: args.passes, time: None };
     let size = (camera.width, camera.height);
-    let rendered = render(&stage, &auto, size, limits, args.threads.into(), &stop, |pass| {
-        if !args.quiet {
-            note(&format!("pass {pass} of {}", args.passes));
-        }
-    })?;
+    let progress = Progress::new(args.quiet, args.passes, u64::from(size.0) * u64::from(size.1));
+    let passed = |pass| progress.passed(pass);
+    let rendered = render(&stage, &auto, size, limits, args.threads.into(), &stop, passed)?;
+    progress.finish();
     if rendered.passes == 0 {
         return Ok(super::interrupted_before_the_first_pass(args.quiet));
     }

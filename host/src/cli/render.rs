@@ -21,6 +21,7 @@ use indicatif::{ProgressBar, ProgressStyle};
 use occlude_kernel::lanes::{Level, level_name};
 use std::io::IsTerminal;
 use std::path::PathBuf;
+use std::sync::Mutex;
 use std::time::{Duration, Instant};
 
 /// Arguments of `occlude render`.
@@ -557,20 +558,20 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     Ok(if rendered.interrupted { Ended::Interrupted } else { Ended::Done })
 }
 
-/// A bar on a terminal, a line a pass in a pipe.
-enum Progress {
+/// A bar on a terminal; in a pipe lines, at most one a second and one for the last pass.
+pub(super) enum Progress {
     Quiet,
     Bar(ProgressBar, u64),
-    Lines { passes: u32, start: Instant },
+    Lines { passes: u32, start: Instant, said: Mutex<Duration> },
 }
 
 impl Progress {
-    fn new(quiet: bool, passes: u32, pixels: u64) -> Self {
+    pub(super) fn new(quiet: bool, passes: u32, pixels: u64) -> Self {
         if quiet {
             return Self::Quiet;
         }
         if !std::io::stderr().is_terminal() {
-            return Self::Lines { passes, start: Instant::now() };
+            return Self::Lines { passes, start: Instant::now(), said: Mutex::default() };
         }
         let bar = ProgressBar::new(u64::from(passes) * pixels);
         let template = "{bar:30} {percent:>3}%  {per_sec} paths, {eta} left";
@@ -584,19 +585,25 @@ impl Progress {
         Self::Bar(bar, pixels)
     }
 
-    fn passed(&self, pass: u32) {
+    pub(super) fn passed(&self, pass: u32) {
         match self {
             Self::Quiet => {}
             Self::Bar(bar, pixels) => bar.set_position(u64::from(pass) * pixels),
-            Self::Lines { passes, start } => {
-                let spent = start.elapsed().as_secs_f64();
+            Self::Lines { passes, start, said } => {
+                let spent = start.elapsed();
+                let mut said = said.lock().unwrap_or_else(|poisoned| poisoned.into_inner());
+                if pass < *passes && spent - *said < Duration::from_secs(1) {
+                    return;
+                }
+                *said = spent;
+                let spent = spent.as_secs_f64();
                 let left = spent / f64::from(pass) * f64::from(passes - pass);
                 note(&format!("pass {pass} of {passes}, {spent:.1} s, {left:.1} s left"));
             }
         }
     }
 
-    fn finish(&self) {
+    pub(super) fn finish(&self) {
         if let Self::Bar(bar, _) = self {
             bar.finish_and_clear();
         }
