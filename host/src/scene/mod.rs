@@ -16,8 +16,12 @@ use glam::Vec3;
 
 use crate::error::{Error, Result};
 
-/// The largest magnitude of a coordinate: squares of it still fit an `f32`.
-pub const MAX_COORDINATE: f32 = 1e18;
+/// The largest magnitude of a coordinate. Beyond ten times that areas and their products leave what `f32` holds, and
+/// pictures are wrong without a sign of it.
+pub const MAX_COORDINATE: f32 = 1e8;
+
+/// How far a scene has to reach along some axis, at the least; below a tenth of that pictures are wrong as well.
+pub const MIN_EXTENT: f32 = 1e-8;
 
 /// What a surface does with light. Both sides reflect; only the front emits.
 #[derive(Clone, Debug, PartialEq)]
@@ -46,7 +50,7 @@ pub struct Object {
 pub struct Scene {
     /// What to call it: the folder's or the file's name.
     pub name: String,
-    /// Vertices, finite, below 1e18 in magnitude.
+    /// Vertices, finite, not beyond [`MAX_COORDINATE`].
     pub positions: Vec<Vec3>,
     /// Three indices into `positions` each.
     pub triangles: Vec<[u32; 3]>,
@@ -110,7 +114,7 @@ impl Scene {
 /// - Names are bytes: any encoding will do, and blanks may be part of them.
 ///
 /// Errors name the file and, where one is at fault, the line. A vertex that is not finite or is
-/// beyond 1e18, a face that names a vertex not defined above it, an unknown material, a missing
+/// beyond [`MAX_COORDINATE`], a scene smaller than [`MIN_EXTENT`], a face that names a vertex not defined above it, an unknown material, a missing
 /// material file, a scene where nothing with an area emits: all are errors.
 ///
 /// The OBJ is read as a stream. Of a closed mesh, a triangle costs about 45 bytes while loading, and

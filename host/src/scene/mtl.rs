@@ -11,6 +11,9 @@ use super::Material;
 use super::lines::{Lines, is_plausible, keyword, shown, words};
 use crate::error::{Error, Result};
 
+/// The largest radiance or reflectance: products of two still fit an `f32`.
+const MAX_COLOUR: f32 = 1e18;
+
 /// What a surface reflects if no file says so.
 pub(super) const DEFAULT_GREY: Vec3 = Vec3::splat(0.5);
 
@@ -184,8 +187,8 @@ fn colour(key: &str, rest: &[u8]) -> std::result::Result<[f32; 3], String> {
         let value = number(word).filter(|v| v.is_finite());
         let value = value
             .ok_or_else(|| format!("{key}: `{}` is not a finite number; write {key} R G B", shown(word)))?;
-        if !(0.0..=super::MAX_COORDINATE).contains(&value) {
-            return Err(format!("{key}: `{}` must lie between 0 and 1e18", shown(word)));
+        if !(0.0..=MAX_COLOUR).contains(&value) {
+            return Err(format!("{key}: `{}` must lie between 0 and {MAX_COLOUR:e}", shown(word)));
         }
         if count < 3 {
             channels[count] = value;
@@ -217,7 +220,7 @@ mod tests {
     fn colours_and_defaults() {
         let library = load(
             b"# of our own\r\n newmtl my box \r\nKd .25\nKe 0 0 0 # none\nillum 2\n\
-              newmtl bo\xeete\nnewmtl lamp\nKe 3 2 1\nnewmtl glow\nKd 0.5 0.25 0\n\tKe 1",
+              newmtl bo\xeete\nnewmtl lamp\nKe 3 2 1\nnewmtl glow\nKd 0.5 0.25 0\n\tKe 1e18",
         )
         .unwrap();
         let material = |name: &[u8]| {
@@ -228,7 +231,7 @@ mod tests {
         assert_eq!(material(b"my box"), ([0.25; 3], [0.0; 3]));
         assert_eq!(material(b"bo\xeete"), ([0.5; 3], [0.0; 3]));
         assert_eq!(material(b"lamp"), ([0.0; 3], [3.0, 2.0, 1.0]));
-        assert_eq!(material(b"glow"), ([0.5, 0.25, 0.0], [1.0; 3]));
+        assert_eq!(material(b"glow"), ([0.5, 0.25, 0.0], [1e18; 3]));
         assert_eq!(library.find(b"box"), None);
         assert_eq!(library.warnings().count(), 0);
     }
@@ -244,7 +247,7 @@ mod tests {
             "Ke -1",
             "Ke nan 1 1",
             "Ke inf",
-            "Ke 1e30",
+            "Ke 2e18",
             "Kd spectral a.rfl",
             "Ke xyz 1 1 1",
             "newmtl",

@@ -195,10 +195,10 @@ impl Checked {
                 }
                 // Any word of digits that overflows is an infinity by now.
                 Some(v) if !v.is_nan() && word.iter().any(u8::is_ascii_digit) => {
-                    "is beyond 1e18; scale or move the scene"
+                    format!("is beyond {:e}; scale the scene down, or move it", super::MAX_COORDINATE)
                 }
-                Some(_) => "is not finite; write a number",
-                None => "is not a number; write three numbers, v X Y Z",
+                Some(_) => "is not finite; write a number".to_owned(),
+                None => "is not a number; write three numbers, v X Y Z".to_owned(),
             };
             return Err(self.fault(line, format!("the vertex coordinate `{}` {what}", shown(word))));
         }
@@ -456,6 +456,14 @@ fn finish(mut checked: Checked, mut scene: Scene, degenerate: u64, guessed: u64)
         let what = "no triangle with an area: the corners of every face lie in one line or point";
         return Err(Error::input(path, what));
     }
+    if let Some((lo, hi)) = scene.bounds()
+        && let extent = (hi - lo).max_element()
+        && extent < super::MIN_EXTENT
+    {
+        let least = super::MIN_EXTENT;
+        let what = format!("the scene is {extent:e} across, which is below {least:e}; scale it up");
+        return Err(Error::input(path, what));
+    }
     scene.triangles.shrink_to_fit();
     scene.triangle_materials.shrink_to_fit();
     scene.positions.shrink_to_fit();
@@ -559,8 +567,8 @@ mod tests {
             ("v", "0 coordinates"),
             ("v 1 nan 2", "`nan` is not finite"),
             ("v 1 -inf 2", "`-inf` is not finite"),
-            ("v 1 1e19 2", "beyond 1e18"),
-            ("v 1 1e400 2", "beyond 1e18"),
+            ("v 1 -1.1e8 2", "beyond 1e8; scale the scene down"),
+            ("v 1 1e400 2", "beyond 1e8; scale the scene down"),
             ("v 1 two 3", "`two` is not a number"),
             ("v 1 2 3,5", "`3,5` is not a number"),
             ("f 1 2", "a face of 2"),
@@ -600,6 +608,18 @@ mod tests {
         assert_fault(square("usemtl my box\nf 1 2 3"), 0, "nothing gives light");
         assert_fault(square("f 1 2 2\nusemtl my box\nf 1 2 3"), 0, "nothing gives light");
         assert_fault(load("v 0 0 0\nv 1 0 0\nv 0 1 0\nf 1 2 3"), 0, "mtllib");
+    }
+
+    #[test]
+    fn scenes_may_be_large_or_small_but_not_anything() {
+        let corners = |size: f32| {
+            let [x, y] = [format!("v {size} 0 0\n"), format!("v 0 {} 0\n", -0.5 * size)];
+            load(format!("mtllib a.mtl\nv 0 0 0\n{x}{y}usemtl lamp\nf 1 2 3"))
+        };
+        corners(1e8).unwrap();
+        corners(1e-8).unwrap();
+        assert_fault(corners(0.9e-8), 0, "9e-9 across, which is below 1e-8; scale it up");
+        assert_fault(corners(1.1e8), 3, "beyond 1e8; scale the scene down");
     }
 
     #[test]
