@@ -180,6 +180,9 @@ pub(crate) struct Needs {
 }
 
 impl Needs {
+    /// What a pixel takes, bytes, with what is due to it.
+    pub(crate) const BYTES_A_PIXEL: usize = size_of::<Seen>() + size_of::<Due>();
+
     /// Nothing yet.
     pub(crate) fn new(width: u32, height: u32) -> Self {
         let (width, height) = (width as usize, height as usize);

@@ -246,6 +246,9 @@ pub struct Film {
 }
 
 impl Film {
+    /// What a pixel takes, bytes, and what it takes more if the film [listens](Film::listening).
+    pub const BYTES_A_PIXEL: [usize; 2] = [size_of::<Accumulator>(), size_of::<Heard>()];
+
     /// Edge of the tiles of [`Film::new`], pixels.
     pub const TILE: u32 = 16;
 

@@ -105,6 +105,26 @@ struct Round {
     passes: u32,
 }
 
+/// Refuses an image that there is no memory for: film, what is known of its pixels, the image, its variance and both as they
+/// are put into a file. To run out of it later would end the program.
+fn check_memory((width, height): (u32, u32), adaptive: bool) -> crate::Result<()> {
+    let [film, listening] = Film::BYTES_A_PIXEL;
+    let image = size_of::<[f32; 3]>();
+    let films = if adaptive { 2 * (film + listening) + Needs::BYTES_A_PIXEL } else { film };
+    let bytes = u64::from(width) * u64::from(height) * (films + 6 * image) as u64;
+    let mut room = Vec::<u8>::new();
+    let got = usize::try_from(bytes).is_ok_and(|bytes| room.try_reserve_exact(bytes).is_ok());
+    // Or the compiler would take it for had.
+    std::hint::black_box(&mut room);
+    if got {
+        return Ok(());
+    }
+    Err(crate::Error::Usage(format!(
+        "an image of {width}x{height} pixels takes about {:.1} GB of memory, and there is not so much: make it smaller, with --size",
+        bytes as f64 * 1e-9
+    )))
+}
+
 #[allow(clippy::too_many_arguments)]
 fn run(
     stage: &Stage<'_>,
@@ -121,6 +141,7 @@ fn run(
         .build()
         .map_err(|error| crate::Error::Usage(format!("cannot start {threads} threads: {error}")))?;
     let adaptive = adaptive && limits.passes >= FEWEST;
+    check_memory(size, adaptive)?;
     let new_film = || {
         let film = Film::new(size.0, size.1);
         if adaptive { film.listening() } else { film }
@@ -225,6 +246,15 @@ fn run(
 #[cfg(test)]
 mod tests {
     use super::*;
+
+    #[test]
+    fn an_image_beyond_all_memory_is_refused() {
+        for adaptive in [false, true] {
+            check_memory((640, 360), adaptive).unwrap();
+            let said = check_memory((u32::MAX, u32::MAX), adaptive).unwrap_err().to_string();
+            assert!(said.contains("4294967295x4294967295") && said.contains("--size"), "{said}");
+        }
+    }
 
     #[test]
     fn rounds_end_where_the_passes_do_and_the_last_is_the_largest() {
