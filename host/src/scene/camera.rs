@@ -219,7 +219,7 @@ pub(super) struct Draft {
     up: Option<Vec3>,
     vfov_deg: Option<f32>,
     size: (Option<u32>, Option<u32>),
-    unknown: Vec<String>,
+    keys: Vec<(String, u64)>,
 }
 
 impl Draft {
@@ -240,26 +240,47 @@ impl Draft {
         let Value::Object(keys) = value else {
             return Err(Error::input(path, r#"a camera is an object: {"eye": [0, 1, 5], ...}"#));
         };
+        self.keys = keys_of(text);
+        for (k, (key, line)) in self.keys.iter().enumerate() {
+            if let Some((_, first)) = self.keys[..k].iter().find(|(other, _)| other == key) {
+                let what = format!("`{key}` stands on line {first} already; leave one of them out");
+                return Err(Error::line(path, *line, what));
+            }
+        }
         let get = |key: &str, replaced: bool| match keys.get(key) {
             _ if replaced => Ok(None),
             Some(value) => Ok(Some(value)),
-            None => Err(Error::input(path, format!("the key `{key}` is missing; add it"))),
+            None => {
+                let what = format!(
+                    "the key `{key}` is missing; add it{}",
+                    self.said_unknown(", and mend or remove ")
+                );
+                Err(Error::input(path, what))
+            }
         };
-        self.eye = get("eye", self.asked.eye.is_some())?.map(|v| vector(path, "eye", v)).transpose()?;
-        self.target =
-            get("target", self.asked.target.is_some())?.map(|v| vector(path, "target", v)).transpose()?;
-        self.up = get("up", self.asked.up.is_some())?.map(|v| vector(path, "up", v)).transpose()?;
-        self.vfov_deg = get("vfov_deg", self.asked.vfov_deg.is_some())?
-            .map(|v| number(path, "vfov_deg", v))
+        let fault = |key: &str, what: String| self.fault(key, key, false, &what);
+        let vector = |key: &str, value| vector(value).map_err(|what| fault(key, what));
+        let eye = get("eye", self.asked.eye.is_some())?.map(|v| vector("eye", v)).transpose()?;
+        let target = get("target", self.asked.target.is_some())?.map(|v| vector("target", v)).transpose()?;
+        let up = get("up", self.asked.up.is_some())?.map(|v| vector("up", v)).transpose()?;
+        let vfov_deg = get("vfov_deg", self.asked.vfov_deg.is_some())?
+            .map(|v| number(v).map_err(|what| fault("vfov_deg", what)))
             .transpose()?;
+        let pixels = |key: &str, value| pixels(value).map_err(|what| fault(key, what));
         let sized = self.asked.size.is_some();
-        let width = get("width", sized)?.map(|v| pixels(path, "width", v)).transpose()?;
-        let height = get("height", sized)?.map(|v| pixels(path, "height", v)).transpose()?;
-        self.size = (width, height);
-
-        let known = ["eye", "target", "up", "vfov_deg", "width", "height"];
-        self.unknown = keys.keys().filter(|k| !known.contains(&k.as_str())).cloned().collect();
+        let width = get("width", sized)?.map(|v| pixels("width", v)).transpose()?;
+        let height = get("height", sized)?.map(|v| pixels("height", v)).transpose()?;
+        (self.eye, self.target, self.up, self.vfov_deg, self.size) =
+            (eye, target, up, vfov_deg, (width, height));
         Ok(())
+    }
+
+    /// The keys that no camera has, with their lines, behind a few words; nothing if there are none.
+    fn said_unknown(&self, before: &str) -> String {
+        const KNOWN: [&str; 6] = ["eye", "target", "up", "vfov_deg", "width", "height"];
+        let unknown = self.keys.iter().filter(|(key, _)| !KNOWN.contains(&key.as_str()));
+        let list: Vec<String> = unknown.map(|(key, line)| format!("`{key}` (line {line})")).collect();
+        if list.is_empty() { String::new() } else { format!("{before}{}", list.join(", ")) }
     }
 
     /// Refuses what no scene could make right.
@@ -317,12 +338,9 @@ impl Draft {
 
     /// Fills in what is missing with a view of the box, and mends an `up` along the view.
     pub(super) fn complete(self, (lo, hi): (Vec3, Vec3), warnings: &mut Vec<String>) -> Result<Camera> {
-        if let (Some(path), false) = (&self.file, self.unknown.is_empty()) {
-            warnings.push(format!(
-                "{}: ignored the unknown keys {}",
-                path.display(),
-                self.unknown.join(", ")
-            ));
+        let unknown = self.said_unknown("ignored the unknown keys ");
+        if let (Some(path), false) = (&self.file, unknown.is_empty()) {
+            warnings.push(format!("{}: {unknown}", path.display()));
         }
         let mut camera = Camera::framing(lo, hi);
         camera.target = self.target.unwrap_or(camera.target);
@@ -355,36 +373,64 @@ impl Draft {
     fn fault(&self, key: &str, option: &str, is_option: bool, what: &str) -> Error {
         match &self.file {
             _ if is_option => Error::Usage(format!("--{option} {what}")),
-            Some(path) => Error::input(path, format!("`{key}` {what}")),
+            Some(path) => {
+                let first = key.split('`').next();
+                let line =
+                    self.keys.iter().find(|(key, _)| Some(key.as_str()) == first).map(|(_, line)| *line);
+                Error::Input { path: path.clone(), line, message: format!("`{key}` {what}") }
+            }
             None => Error::Usage(format!("the camera's `{key}` {what}")),
         }
     }
 }
 
-/// Three numbers of a camera file.
-fn vector(path: &Path, key: &str, value: &Value) -> Result<Vec3> {
+/// Three numbers of a camera file; or what is wrong with them.
+fn vector(value: &Value) -> std::result::Result<Vec3, String> {
     let numbers: Option<Vec<f32>> =
         value.as_array().and_then(|v| v.iter().map(|x| x.as_f64().map(|x| x as f32)).collect());
     match numbers.as_deref() {
         Some(&[x, y, z]) => Ok(Vec3::new(x, y, z)),
-        _ => Err(Error::input(path, format!("`{key}` is {}; write three numbers, [x, y, z]", shown(value)))),
+        _ => Err(format!("is {}; write three numbers, [x, y, z]", shown(value))),
     }
 }
 
 /// A number of a camera file.
-fn number(path: &Path, key: &str, value: &Value) -> Result<f32> {
-    let fault = || Error::input(path, format!("`{key}` is {}; write a number", shown(value)));
-    value.as_f64().map(|x| x as f32).ok_or_else(fault)
+fn number(value: &Value) -> std::result::Result<f32, String> {
+    value.as_f64().map(|x| x as f32).ok_or_else(|| format!("is {}; write a number", shown(value)))
 }
 
 /// A number of pixels in a camera file. `96.0` will do, as some programs write all numbers like that.
-fn pixels(path: &Path, key: &str, value: &Value) -> Result<u32> {
+fn pixels(value: &Value) -> std::result::Result<u32, String> {
     let whole = value.as_f64().filter(|x| x.fract() == 0.0 && (1.0..=f64::from(MAX_SIDE)).contains(x));
-    let fault = || {
-        let what = format!("`{key}` is {}; write a whole number of pixels, 1 to {MAX_SIDE}", shown(value));
-        Error::input(path, what)
-    };
+    let fault = || format!("is {}; write a whole number of pixels, 1 to {MAX_SIDE}", shown(value));
     whole.map(|x| x as u32).ok_or_else(fault)
+}
+
+/// The keys of an object of JSON that is valid, and their lines: its parser keeps the last of two equal ones, and no line.
+fn keys_of(text: &[u8]) -> Vec<(String, u64)> {
+    let (mut keys, mut depth, mut line, mut at) = (Vec::new(), 0, 1, 0);
+    while at < text.len() {
+        match text[at] {
+            b'\n' => line += 1,
+            b'{' | b'[' => depth += 1,
+            b'}' | b']' => depth -= 1,
+            b'"' => {
+                let start = at + 1;
+                at = start;
+                while at < text.len() && text[at] != b'"' {
+                    at += if text[at] == b'\\' { 2 } else { 1 };
+                }
+                let string = &text[start.min(text.len())..at.min(text.len())];
+                let behind = text.get(at + 1..).unwrap_or_default().trim_ascii_start();
+                if depth == 1 && behind.first() == Some(&b':') {
+                    keys.push((String::from_utf8_lossy(string).into_owned(), line));
+                }
+            }
+            _ => {}
+        }
+        at += 1;
+    }
+    keys
 }
 
 /// The beginning of a JSON value, for a message.
@@ -441,7 +487,23 @@ mod tests {
         ] {
             let message = message(from, to);
             assert!(message.contains("camera.json") && message.contains(key), "{from} -> {to}: {message}");
+            let line = if JSON.find(from) < JSON.find("vfov_deg") { 1 } else { 2 };
+            let line = if key.contains("missing") { String::new() } else { format!(":{line}") };
+            assert!(message.contains(&format!("camera.json{line}: ")), "{from} -> {to}: {message}");
         }
+        assert!(message("\"eye\"", "\"eyes\"").contains("mend or remove `eyes` (line 1)"));
+    }
+
+    #[test]
+    fn keys_have_lines_and_come_once() {
+        let said = message("96,", "96,\n\"vfov_deg\" : 50,");
+        assert!(said.contains("camera.json:3: `vfov_deg` stands on line 2 already"), "{said}");
+        let text = b"{\"a\": {\"b\": [1, \"c\\\"\"]},\n\"d\": \"e:\",\r\n\"f\\\\\" : {}}";
+        let keys = keys_of(text);
+        assert_eq!(
+            keys.iter().map(|(key, line)| (key.as_str(), *line)).collect::<Vec<_>>(),
+            [("a", 1), ("d", 2), ("f\\\\", 3)]
+        );
     }
 
     #[test]
@@ -474,7 +536,7 @@ mod tests {
         assert_ne!(camera.up, Vec3::Y);
         assert_eq!(warnings.len(), 1);
         let (_, warnings) = read(&JSON.replacen('{', "{\"fov\": 3,", 1), &CameraRequest::default()).unwrap();
-        assert!(warnings[0].contains("fov"), "{warnings:?}");
+        assert!(warnings[0].contains("ignored the unknown keys `fov` (line 1)"), "{warnings:?}");
     }
 
     #[test]
