@@ -17,6 +17,9 @@ const MAX_COLOUR: f32 = 1e18;
 /// What a surface reflects if no file says so.
 pub(super) const DEFAULT_GREY: Vec3 = Vec3::splat(0.5);
 
+/// Statements that say what this renderer has no part in: highlights, refraction, other models of light.
+const OF_OTHERS: &str = "Ka Ks Km Ns Ni Tf Tr d illum sharpness Pr Pm Ps Pc Pcr aniso anisor";
+
 /// The materials of all libraries that an OBJ names.
 ///
 /// The last definition of a name counts. Without `Kd` a material is grey, [`DEFAULT_GREY`], or black
@@ -29,6 +32,7 @@ pub(super) struct Library {
     duplicates: Vec<String>,
     bright: Vec<String>,
     ignored: BTreeSet<String>,
+    unknown: BTreeSet<String>,
 }
 
 impl Library {
@@ -131,7 +135,7 @@ impl Library {
         self.materials.is_empty()
     }
 
-    /// Remembers a statement that would change the picture if it were heeded.
+    /// Remembers a statement that would change the picture if it were heeded, and one that nobody knows.
     fn note_ignored(&mut self, word: &[u8], rest: &[u8]) {
         let is_texture =
             word.starts_with(b"map_") || [&b"bump"[..], b"disp", b"decal", b"refl", b"norm"].contains(&word);
@@ -141,8 +145,10 @@ impl Library {
             b"Tr" => value.is_some_and(|v| v > 0.0),
             _ => false,
         };
-        if (is_texture || is_see_through) && self.ignored.len() < 12 {
-            self.ignored.insert(shown(word));
+        if is_texture || is_see_through {
+            note(&mut self.ignored, word);
+        } else if !OF_OTHERS.split(' ').any(|known| known.as_bytes() == word) {
+            note(&mut self.unknown, word);
         }
     }
 
@@ -160,7 +166,18 @@ impl Library {
             let kinds: Vec<&str> = self.ignored.iter().map(String::as_str).collect();
             format!("textures and transparency are ignored ({} in {})", kinds.join(", "), self.file_names())
         });
-        [duplicates, bright, ignored].into_iter().flatten()
+        let unknown = (!self.unknown.is_empty()).then(|| {
+            let kinds: Vec<&str> = self.unknown.iter().map(String::as_str).collect();
+            format!("ignored the statements {} in {}", kinds.join(", "), self.file_names())
+        });
+        [duplicates, bright, ignored, unknown].into_iter().flatten()
+    }
+}
+
+/// Keeps a few words for a message.
+fn note(words: &mut BTreeSet<String>, word: &[u8]) {
+    if words.len() < 12 {
+        words.insert(shown(word));
     }
 }
 
@@ -263,12 +280,14 @@ mod tests {
 
     #[test]
     fn odd_but_usable() {
-        let library =
-            load(b"newmtl a\nKd 5\nmap_Kd a.png\nd 0.5\nnewmtl a\nKd 0.125\nd 1\nbump a.png\nmtllib a.mtl")
-                .unwrap();
+        let library = load(
+            b"newmtl a\nKd 5\nmap_Kd a.png\nd 0.5\nnewmtl a\nKd 0.125\nd 1\nkd 1\nbump a.png\nmtllib a.mtl",
+        )
+        .unwrap();
         assert_eq!(library.materials[library.find(b"a").unwrap() as usize].diffuse, Vec3::splat(0.125));
         let warnings: Vec<String> = library.warnings().collect();
-        assert_eq!(warnings.len(), 3, "{warnings:?}");
+        assert_eq!(warnings.len(), 4, "{warnings:?}");
         assert!(warnings[2].contains("bump, d, map_Kd"), "{warnings:?}");
+        assert!(warnings[3].contains("ignored the statements kd, mtllib in a.mtl"), "{warnings:?}");
     }
 }
