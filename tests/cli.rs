@@ -173,8 +173,8 @@ fn quiet_is_quiet() {
 fn errors_end_with_two_and_name_the_cause() {
     let folder = tempfile::tempdir().expect("a folder");
     let (cornell, half_plane) = (scene("cornell"), scene("half_plane"));
+    let file = &format!("{cornell}/scene.obj");
     let cases: &[(&[&str], &str)] = &[
-        (&["render", "nowhere"], "nowhere"),
         (&["render", &cornell, "-o", "a.jpg"], "png"),
         (&["render", &cornell, "-o", "missing/a.png"], "missing"),
         (&["render", &cornell, "--spp", "0"], "spp"),
@@ -182,7 +182,6 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["render", &cornell, "--size", "0x9"], "size"),
         (&["render", &cornell, "--vfov", "180"], "vfov"),
         (&["render", &cornell, "--eye", "1,2"], "three numbers"),
-        (&["render", &cornell, "--reference", "none.exr"], "none.exr"),
         (&["render", &cornell, "--split", "sorted"], "--split is an option of --method stochastic"),
         (
             &["render", &cornell, "--method", "stochastic", "--volumetric", "on"],
@@ -304,6 +303,17 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["compare-methods", &cornell, "--reference-rays", "-1"], "a whole number from 1 to"),
         (&["reproduce", "theory", "--seed", "-1"], "a whole number from 0 to"),
         (&["generate", "hair", "-t", "-1"], "2M is needed"),
+        (&["render", "nowhere"], "name a folder with a scene.obj"),
+        (&["render", &cornell, "--map", "none.map"], "occlude map SCENE -o none.map"),
+        (&["render", &cornell, "--camera", "none.json"], "the camera file none.json: there is no such file"),
+        (&["render", &cornell, "--reference", "none.exr"], "the image none.exr: there is no such file"),
+        (&["photons", &cornell, "-o", "a.xyz"], ".ply"),
+        (&["photons", &cornell, "-o", "a.png", "--blocker-trees"], "--blocker-trees"),
+        (&["generate", "hair", "-o", file], "a folder is wanted"),
+        (&["generate", "hair", "-o", file, "--force"], "a folder is wanted"),
+        (&["map", file, "--passes", "3"], "--output <FILE>"),
+        (&["map", file, "--inspect", "--seed", "3"], "--seed"),
+        (&["map", "none.map", "--size", "3x3"], "--size is for a scene"),
         (&["frobnicate"], "frobnicate"),
     ];
     for (args, cause) in cases {

@@ -87,6 +87,11 @@ pub fn write(
     Destination::of(path)?.save(&bytes)
 }
 
+/// Whether the name ends like that of an image.
+pub fn is_image(path: impl AsRef<Path>) -> bool {
+    Format::of(path.as_ref()).is_ok()
+}
+
 /// Whether [`write()`] to this path is going to work, as far as can be told before there is an image.
 ///
 /// The extension has to be known, the folder has to exist and let a file be made in it, and what stands

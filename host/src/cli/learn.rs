@@ -10,7 +10,8 @@ use crate::sampler::Pattern;
 use crate::{light, output, scene};
 use clap::Args;
 use occlude_kernel::lanes::Level;
-use std::path::PathBuf;
+use std::io::ErrorKind;
+use std::path::{Path, PathBuf};
 
 /// Arguments of `occlude map`.
 #[derive(Debug, Args)]
@@ -28,26 +29,32 @@ pub(super) struct LearnArgs {
     inspect: bool,
 
     /// Passes to learn from.
+    #[arg(requires = "output", conflicts_with = "inspect")]
     #[arg(long, default_value_t = 8, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
     passes: u32,
 
     /// Shadow rays a camera sample, over all lights together.
+    #[arg(requires = "output", conflicts_with = "inspect")]
     #[arg(long, default_value_t = 64, value_name = "N", value_parser = whole::<u32>(1..=65536))]
     shadow_rays: u32,
 
     /// Bytes that the map may take, like 64M [default: 256M].
+    #[arg(requires = "output", conflicts_with = "inspect")]
     #[arg(long, value_name = "BYTES", allow_hyphen_values = true, value_parser = memory)]
     map_memory: Option<usize>,
 
     /// How long to look for a good tree.
+    #[arg(requires = "output", conflicts_with = "inspect")]
     #[arg(long, value_enum, default_value_t)]
     quality: Quality,
 
     /// Threads; 0 for one a core. The map is the same for any number.
+    #[arg(requires = "output", conflicts_with = "inspect")]
     #[arg(long, default_value_t = 0, value_name = "T", value_parser = whole::<u16>(0..=1024))]
     threads: u16,
 
     /// Seed of the random numbers.
+    #[arg(requires = "output", conflicts_with = "inspect")]
     #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
@@ -79,6 +86,17 @@ pub(super) fn options(memory: Option<usize>) -> AutoOptions {
     AutoOptions { memory: memory.unwrap_or(default.memory), ..default }
 }
 
+/// Reads a map.
+pub(super) fn read(path: &Path) -> Result<SavedMap> {
+    SavedMap::read(path).map_err(|error| match error {
+        Error::Io { source, .. } if source.kind() == ErrorKind::NotFound => Error::Usage(format!(
+            "reading {0}: there is no such map; mend the name, or make one with `occlude map SCENE -o {0}`",
+            path.display()
+        )),
+        error => error,
+    })
+}
+
 /// Runs the command.
 pub(super) fn run(args: &LearnArgs, level: Level) -> Result<Ended> {
     let Some(path) = &args.output else {
@@ -90,7 +108,12 @@ pub(super) fn run(args: &LearnArgs, level: Level) -> Result<Ended> {
                 args.input.display()
             )));
         }
-        print(&SavedMap::read(&args.input)?.describe())?;
+        if let Some(option) = args.camera.given() {
+            return Err(Error::Usage(format!(
+                "{option} is for a scene: a map is only looked into without -o"
+            )));
+        }
+        print(&read(&args.input)?.describe())?;
         return Ok(Ended::Done);
     };
     output::check_writable_bytes(path)?;

@@ -10,10 +10,9 @@ use crate::scene::Scene;
 use crate::volumetric::Volumes;
 use clap::Args;
 
-/// The occlusion map's options.
+/// The options of photons, under the heading of whoever has them.
 #[derive(Debug, Args)]
-#[command(next_help_heading = "Occlusion map (--method map, or stochastic --blockers map)")]
-pub struct MapArgs {
+pub struct PhotonOptions {
     /// Photons to shoot: lines from the lights [default: four a triangle, 250 000 to 4 000 000].
     #[arg(long, value_name = "N", value_parser = whole::<u64>(1..=100_000_000))]
     photons: Option<u64>,
@@ -35,6 +34,14 @@ pub struct MapArgs {
     /// subtree of the scene's tree with at most SIZE triangles) [default: treelet:128].
     #[arg(long, value_name = "KIND")]
     blocker_kind: Option<BlockerKind>,
+}
+
+/// The occlusion map's options.
+#[derive(Debug, Args)]
+#[command(next_help_heading = "Occlusion map (--method map, or stochastic --blockers map)")]
+pub struct MapArgs {
+    #[command(flatten)]
+    photons: PhotonOptions,
 
     /// A tree over the triangles that photons name, built for each point and light, as the thesis does; with --method
     /// stochastic one over each half of them. Photons then name triangles.
@@ -75,18 +82,40 @@ fn radius(text: &str) -> std::result::Result<f32, String> {
     if value > 0.0 && value.is_finite() { Ok(value) } else { Err("must be finite and above 0".to_owned()) }
 }
 
-impl MapArgs {
+impl PhotonOptions {
     /// The first option that was given.
-    pub fn given(&self) -> Option<&'static str> {
+    fn given(&self) -> Option<&'static str> {
         let given = [
             (self.photons.is_some(), "--photons"),
             (self.photon_rounds.is_some(), "--photon-rounds"),
             (self.photon_k.is_some(), "--photon-k"),
             (self.photon_radius.is_some(), "--photon-radius"),
             (self.blocker_kind.is_some(), "--blocker-kind"),
-            (self.blocker_trees, "--blocker-trees"),
         ];
         given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
+    }
+
+    /// What they ask for.
+    pub fn options(&self, quality: Quality) -> MapOptions {
+        self.of_kind(self.blocker_kind, quality)
+    }
+
+    fn of_kind(&self, kind: Option<BlockerKind>, quality: Quality) -> MapOptions {
+        MapOptions {
+            lines: self.photons,
+            rounds: self.photon_rounds.unwrap_or(1),
+            k: self.photon_k.unwrap_or(50) as usize,
+            radius: self.photon_radius,
+            blockers: kind.unwrap_or_default(),
+            quality,
+        }
+    }
+}
+
+impl MapArgs {
+    /// The first option that was given.
+    pub fn given(&self) -> Option<&'static str> {
+        self.photons.given().or(self.blocker_trees.then_some("--blocker-trees"))
     }
 
     /// Whether `--blockers` was given.
@@ -101,7 +130,7 @@ impl MapArgs {
 
     /// What they ask for.
     pub fn options(&self, quality: Quality) -> Result<MapOptions> {
-        let kind = match (self.blockers, self.blocker_kind) {
+        let kind = match (self.blockers, self.photons.blocker_kind) {
             (Some(Asked::All), _) => {
                 return Err(Error::Usage(
                     "--blockers all is for --method stochastic: a map asks what its photons name; give a kind, \
@@ -123,7 +152,7 @@ impl MapArgs {
     /// The map that `--method stochastic` is to ask, if any.
     pub fn below_stochastic(&self, quality: Quality) -> Result<Option<MapOptions>> {
         match (self.blockers, self.given()) {
-            (Some(Asked::Map), _) => self.of_kind(self.blocker_kind, quality).map(Some),
+            (Some(Asked::Map), _) => self.of_kind(self.photons.blocker_kind, quality).map(Some),
             (Some(Asked::Kind(kind)), _) => Err(Error::Usage(format!(
                 "--blockers is all or map with --method stochastic: give --blockers map --blocker-kind {kind}"
             ))),
@@ -145,14 +174,7 @@ impl MapArgs {
             None if self.blocker_trees => Some(BlockerKind::Triangle),
             kind => kind,
         };
-        Ok(MapOptions {
-            lines: self.photons,
-            rounds: self.photon_rounds.unwrap_or(1),
-            k: self.photon_k.unwrap_or(50) as usize,
-            radius: self.photon_radius,
-            blockers: kind.unwrap_or_default(),
-            quality,
-        })
+        Ok(self.photons.of_kind(kind, quality))
     }
 }
 

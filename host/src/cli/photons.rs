@@ -1,6 +1,6 @@
 //! `occlude photons`: shows the occlusion map.
 
-use super::map::{self, MapArgs};
+use super::map::{self, PhotonOptions};
 use super::render::CameraArgs;
 use super::{note, whole};
 use crate::accel::{Accel, Quality};
@@ -49,8 +49,8 @@ pub struct PhotonsArgs {
     #[arg(long, default_value_t = 0, value_name = "S", value_parser = whole::<u64>(0..=u64::MAX))]
     seed: u64,
 
-    #[command(flatten)]
-    map: MapArgs,
+    #[command(flatten, next_help_heading = "Photons")]
+    map: PhotonOptions,
 
     #[command(flatten)]
     camera: CameraArgs,
@@ -75,8 +75,13 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     let cloud = args.output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"));
     if cloud {
         output::check_writable_bytes(&args.output)?;
-    } else {
+    } else if output::is_image(&args.output) {
         output::check_writable(&args.output)?;
+    } else {
+        return Err(Error::Usage(format!(
+            "{}: name an image, .png, .exr, .hdr or .pfm, or points, .ply",
+            args.output.display()
+        )));
     }
     let scene = scene::load(&args.scene, &args.camera.request())?;
     scene.warnings.iter().for_each(|warning| note(&format!("warning: {warning}")));
@@ -98,7 +103,7 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
         level,
         count: false,
     };
-    let prepared = map::prepare(&stage, &args.map.options(args.quality)?, args.threads.into())?;
+    let prepared = map::prepare(&stage, &args.map.options(args.quality), args.threads.into())?;
     let store = &prepared.store;
     let rounds = match store.stats.rounds {
         1 => "evenly".to_owned(),

@@ -5,8 +5,8 @@ use super::{Ended, learn, note, whole};
 use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{
-    Auto, AutoOptions, Exact, Form, Map, MapOptions, MapTerms, Rule, SavedMap, Settings, Split, Stage,
-    Stochastic, Visibility, Walled,
+    Auto, AutoOptions, Exact, Form, Map, MapOptions, MapTerms, Rule, Settings, Split, Stage, Stochastic,
+    Visibility, Walled,
 };
 use crate::photons::BlockerKind;
 use crate::render::{Limits, render, render_adaptively};
@@ -249,6 +249,19 @@ pub struct CameraArgs {
 }
 
 impl CameraArgs {
+    /// The first option that was given.
+    pub fn given(&self) -> Option<&'static str> {
+        let given = [
+            (self.size.is_some(), "--size"),
+            (self.camera.is_some(), "--camera"),
+            (self.eye.is_some(), "--eye"),
+            (self.target.is_some(), "--target"),
+            (self.up.is_some(), "--up"),
+            (self.vfov.is_some(), "--vfov"),
+        ];
+        given.into_iter().find(|(given, _)| *given).map(|(_, name)| name)
+    }
+
     /// The same for [`scene::load`].
     pub fn request(&self) -> CameraRequest {
         CameraRequest {
@@ -375,7 +388,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
         output::check_writable_bytes(path)?;
     }
     let reference = args.reference.as_ref().map(output::read).transpose()?;
-    let learned = args.auto.file.as_ref().map(SavedMap::read).transpose()?;
+    let learned = args.auto.file.as_deref().map(learn::read).transpose()?;
 
     let start = Instant::now();
     let scene = scene::load(&args.scene, &args.camera.request())?;
