@@ -20,6 +20,7 @@ pub fn write(scene: &Scene, folder: &Path) -> Result<()> {
     let occupied = match fs::read_dir(folder) {
         Ok(mut entries) => entries.next().is_some(),
         Err(error) if error.kind() == io::ErrorKind::NotFound => false,
+        Err(error) if error.kind() == io::ErrorKind::NotADirectory => return Err(not_a_folder(folder)),
         Err(error) => return Err(Error::io("reading", folder)(error)),
     };
     if occupied {
@@ -28,8 +29,15 @@ pub fn write(scene: &Scene, folder: &Path) -> Result<()> {
     overwrite(scene, folder)
 }
 
+fn not_a_folder(path: &Path) -> Error {
+    Error::input(path, "this is a file, and a folder is wanted: name another one")
+}
+
 /// Like [`write()`], but replaces a scene that is there. Other files in the folder stay.
 pub fn overwrite(scene: &Scene, folder: &Path) -> Result<()> {
+    if fs::metadata(folder).is_ok_and(|there| !there.is_dir()) {
+        return Err(not_a_folder(folder));
+    }
     fs::create_dir_all(folder).map_err(Error::io("creating", folder))?;
     let names = material_names(&scene.materials);
     let mut drafts = Vec::new();

@@ -9,6 +9,7 @@ mod polygon;
 pub use camera::{Camera, CameraRequest, Frame, MAX_PIXELS, MAX_SIDE};
 
 use std::fs::File;
+use std::io::ErrorKind;
 use std::ops::Range;
 use std::path::{Path, PathBuf};
 
@@ -146,7 +147,14 @@ fn is_obj(path: &Path) -> bool {
 
 /// The file to read for a path that may be a folder.
 fn scene_file(path: &Path) -> Result<PathBuf> {
-    if !std::fs::metadata(path).map_err(Error::io("reading the scene", path))?.is_dir() {
+    let found = std::fs::metadata(path).map_err(|error| match error.kind() {
+        ErrorKind::NotFound => {
+            let what = "there is no such scene; name a folder with a scene.obj, or an .obj file";
+            Error::input(path, what)
+        }
+        _ => Error::io("reading the scene", path)(error),
+    })?;
+    if !found.is_dir() {
         return Ok(path.to_owned());
     }
     if is_obj(path) {
