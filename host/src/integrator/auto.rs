@@ -66,7 +66,7 @@ pub struct AutoOptions {
 
 impl Default for AutoOptions {
     fn default() -> Self {
-        Self { cell: 4.0, photons: None, memory: 256 << 20 }
+        Self { cell: 8.0, photons: None, memory: 256 << 20 }
     }
 }
 
@@ -543,6 +543,8 @@ impl Map {
         }
         self.passes = saved.passes;
         self.doubts = saved.doubts;
+        self.kinds = saved.kinds;
+        self.variances = saved.kinds.variances();
         self.table.resize(OcclusionMap::table(self.cells.len()), OcclusionMap::FREE);
         OcclusionMap::index(&self.cells, &mut self.table);
     }
@@ -772,6 +774,7 @@ impl Auto {
             passes: map.passes,
             shadow_rays: stage.shadow_rays,
             doubts: map.doubts,
+            kinds: map.kinds,
             cells: cells
                 .map(|(index, (&cell, &points))| SavedCell { cell, points, tallies: map.tally(index) })
                 .collect(),

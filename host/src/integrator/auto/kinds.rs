@@ -17,7 +17,7 @@ const AROUND: usize = 3;
 /// Passes by their power of two, and as many in the last.
 const AGES: usize = 6;
 
-const KINDS: usize = STATES * AROUND * AGES;
+pub(super) const KINDS: usize = STATES * AROUND * AGES;
 
 /// The kind of a pixel, or of one that has not been asked yet.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
@@ -39,7 +39,7 @@ impl Kind {
 /// Sums over batches of n samples that saw the part v: of n v (1 - v), in units of 1/[`PARTS`], and of n - 1. Their ratio is
 /// the variance of a sample. In whole numbers, so that their order does not matter.
 #[derive(Clone, Copy, Debug, PartialEq, Eq)]
-pub(super) struct Seen([[u64; 2]; KINDS]);
+pub(super) struct Seen(pub(super) [[u64; 2]; KINDS]);
 
 const PARTS: f32 = 4096.0;
 

@@ -3,11 +3,12 @@
 //! ```text
 //! 8 bytes   "occlmap" and a line feed
 //! u32       0x01020304, which tells the order of bytes
-//! u32       the version, 1
+//! u32       the version, 2
 //! u64       the hash of the triangles and lights it belongs to
 //! u64       cells
 //! u32, u32  passes; shadow rays of a camera sample
 //! 16 × u64  rays by class of doubt, and as many: how far guesses were off
+//! 72 × 2 × u64   by kind of pixel, how far samples were apart, and how many
 //! of each cell
 //!     u64       its key
 //!     9 × f32   its normal and bounds
@@ -18,6 +19,7 @@
 //!
 //! Numbers have their lowest byte first. What is proven is not in it: a map proves it again.
 
+use super::kinds::{KINDS, Seen};
 use crate::error::{Error, Result};
 use crate::integrator::Stage;
 use crate::light::Shape;
@@ -27,8 +29,8 @@ use std::path::Path;
 
 const MAGIC: &[u8; 8] = b"occlmap\n";
 const ORDER: u32 = 0x0102_0304;
-const VERSION: u32 = 1;
-const HEAD: usize = 8 + 4 + 4 + 8 + 8 + 4 + 4 + 2 * CLASSES * 8;
+const VERSION: u32 = 2;
+const HEAD: usize = 8 + 4 + 4 + 8 + 8 + 4 + 4 + 2 * CLASSES * 8 + 2 * KINDS * 8;
 const EACH: usize = 8 + 9 * 4 + 4 + BINS * 8;
 
 /// What a map has learned.
@@ -42,6 +44,7 @@ pub struct SavedMap {
     pub shadow_rays: u32,
     /// How far guesses were off.
     pub doubts: Doubts,
+    pub(super) kinds: Seen,
     pub(super) cells: Vec<SavedCell>,
 }
 
@@ -144,6 +147,7 @@ impl SavedMap {
         bytes.extend([self.passes, self.shadow_rays].iter().flat_map(|word| word.to_le_bytes()));
         let counts = self.doubts.asked.iter().chain(&self.doubts.squared);
         bytes.extend(counts.flat_map(|word| word.to_le_bytes()));
+        bytes.extend(self.kinds.0.iter().flatten().flat_map(|word| word.to_le_bytes()));
         for SavedCell { cell, points, tallies } in &self.cells {
             bytes.extend(cell.key().bits().to_le_bytes());
             bytes.extend(cell.bounds().iter().flatten().flat_map(|at| at.to_le_bytes()));
@@ -196,8 +200,10 @@ impl SavedMap {
             asked: std::array::from_fn(|_| rest.u64()),
             squared: std::array::from_fn(|_| rest.u64()),
         };
+        let kinds = Seen(std::array::from_fn(|_| [rest.u64(), rest.u64()]));
         // Sums of these must not overflow.
-        if doubts.asked.iter().chain(&doubts.squared).any(|&count| count > u64::MAX / 4) {
+        let counts = doubts.asked.iter().chain(&doubts.squared).chain(kinds.0.iter().flatten());
+        if counts.copied().any(|count| count > u64::MAX / 4) {
             return Err(damaged("is damaged"));
         }
         let mut cells = Vec::with_capacity(count as usize);
@@ -212,7 +218,7 @@ impl SavedMap {
             }
             cells.push(SavedCell { cell, points, tallies });
         }
-        Ok(Self { belongs_to, passes, shadow_rays, doubts, cells })
+        Ok(Self { belongs_to, passes, shadow_rays, doubts, kinds, cells })
     }
 
     /// Reads a file.
@@ -314,7 +320,9 @@ mod tests {
         let mut doubts = Doubts::default();
         doubts.asked[3] = 1 << 20;
         doubts.squared[3] = 1 << 30;
-        SavedMap { belongs_to: 42, passes: 7, shadow_rays: 64, doubts, cells }
+        let mut kinds = Seen::default();
+        kinds.0[KINDS - 1] = [1 << 40, 3];
+        SavedMap { belongs_to: 42, passes: 7, shadow_rays: 64, doubts, kinds, cells }
     }
 
     #[test]
@@ -324,7 +332,7 @@ mod tests {
         let again = SavedMap::from_bytes(&bytes).expect("whole");
         assert_eq!(again.to_bytes(), bytes);
         assert_eq!((again.belongs_to, again.passes, again.shadow_rays), (42, 7, 64));
-        assert_eq!(again.doubts, first.doubts);
+        assert_eq!((again.doubts, again.kinds), (first.doubts, first.kinds));
         assert!(again.describe().contains("7 passes of 64"));
     }
 
@@ -363,6 +371,9 @@ mod tests {
         let mut impossible = saved();
         impossible.cells[1].tallies[3] = Tally { asked: 1, free: 2 };
         assert!(SavedMap::from_bytes(&impossible.to_bytes()).is_err());
+        let mut endless = saved();
+        endless.kinds.0[5][1] = u64::MAX;
+        assert!(SavedMap::from_bytes(&endless.to_bytes()).is_err(), "the next would overflow");
         let mut nowhere = saved();
         nowhere.cells[2].cell = MapCell::new(nowhere.cells[2].cell.key(), [0.0, 0.0, 1.0]);
         assert!(SavedMap::from_bytes(&nowhere.to_bytes()).is_err(), "bounds without end");
