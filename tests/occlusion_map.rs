@@ -453,7 +453,7 @@ fn pictures_are_right_on_average_whatever_the_map_holds() {
         check("a map with room for few cells", &Auto::new(small));
         let empty = AutoOptions { memory: 0, ..AutoOptions::default() };
         check("an empty map", &Auto::new(empty));
-        let large = AutoOptions { cell: 64.0, ..AutoOptions::default() };
+        let large = AutoOptions { cell: Some(64.0), ..AutoOptions::default() };
         check("cells as large as half the picture", &Auto::new(large));
         let least = |cells: &mut [MapCell]| {
             let rates = Rates::each(0.0);

@@ -56,8 +56,9 @@ use std::sync::{Mutex, MutexGuard, RwLock};
 /// How the map is made.
 #[derive(Clone, Copy, Debug)]
 pub struct AutoOptions {
-    /// Pixels across a cell, at least: cells have edges of one to two times that many.
-    pub cell: f32,
+    /// Pixels across a cell, at least: cells have edges of one to two times that many. If not given, 4 for 64 shadow rays
+    /// of a camera sample or more, and up to 8 for fewer, so that cells hear of as many.
+    pub cell: Option<f32>,
     /// Photons to shoot before the first pass; if not given, some where a point has few shadow rays, and else none.
     pub photons: Option<u64>,
     /// Bytes that cells, and what pixels remember, may take.
@@ -66,8 +67,13 @@ pub struct AutoOptions {
 
 impl Default for AutoOptions {
     fn default() -> Self {
-        Self { cell: 8.0, photons: None, memory: 256 << 20 }
+        Self { cell: None, photons: None, memory: 256 << 20 }
     }
+}
+
+/// Pixels across a cell that hears of so many shadow rays of each camera sample.
+fn pixels_across(shadow_rays: u32) -> f32 {
+    (32.0 / (shadow_rays.max(1) as f32).sqrt()).clamp(4.0, 8.0)
 }
 
 /// Bytes of a cell, with what is counted for it.
@@ -148,8 +154,9 @@ struct Map {
     tries: Vec<u8>,
     /// Cells that were lit before they grew.
     before: Vec<(usize, MapCell)>,
-    /// The angle of a pixel.
+    /// The angle of a pixel, and pixels across a cell.
     angle: f32,
+    cell: f32,
     /// How far guesses were off.
     doubts: Doubts,
     /// And what follows from that.
@@ -198,6 +205,7 @@ impl Default for Map {
             tries: Vec::new(),
             before: Vec::new(),
             angle: 0.0,
+            cell: 0.0,
             doubts: Doubts::default(),
             rates: Rates::each(1.0),
             promise: 1.0,
@@ -511,8 +519,8 @@ impl Map {
         OcclusionMap::new(&self.cells, &self.table).expect("a table of these cells")
     }
 
-    fn key(&self, options: &AutoOptions, eye: Vec3, x: Vec3, normal: Vec3, light: u32) -> Option<CellKey> {
-        let size = x.distance(eye) * self.angle * options.cell;
+    fn key(&self, eye: Vec3, x: Vec3, normal: Vec3, light: u32) -> Option<CellKey> {
+        let size = x.distance(eye) * self.angle * self.cell;
         CellKey::new(x, normal, CellKey::level(size), light)
     }
 
@@ -817,7 +825,7 @@ impl Auto {
             let (mut sums, mut total) = ([0.0; 3], 0.0f32);
             for (light, area) in (0..).zip(stage.lights) {
                 let Some(unshadowed) = area.unshadowed(point.x, point.normal) else { continue };
-                let key = map.key(&self.options, stage.eye, point.x, point.normal, light);
+                let key = map.key(stage.eye, point.x, point.normal, light);
                 let cell = key.and_then(|key| view.find(key)).map(|cell| &view.cells()[cell]);
                 let value = unshadowed * area.radiance.element_sum();
                 total += value;
@@ -899,6 +907,9 @@ impl Visibility for Auto {
             let pasts = |tile: &Tile| TilePast { pasts: each(tile), ..TilePast::default() };
             map.pasts = tiles.iter().map(|tile| ([tile.x, tile.y], Mutex::new(pasts(tile)))).collect();
         }
+        // Those of a map that was made before are as large as they were.
+        let rays = self.before.as_ref().map_or(stage.shadow_rays, |before| before.shadow_rays);
+        map.cell = self.options.cell.unwrap_or_else(|| pixels_across(rays));
         if let Some(before) = &self.before {
             map.remember(before);
         }
@@ -916,7 +927,7 @@ impl Visibility for Auto {
                 cast(&Stage { count: false, ..*stage }, tile, width, scratch);
                 let mut strays = Vec::new();
                 for point in &scratch.questions.points {
-                    let key = found.key(&self.options, stage.eye, point.x, point.normal, 0);
+                    let key = found.key(stage.eye, point.x, point.normal, 0);
                     for (light, area) in (0..).zip(stage.lights) {
                         if area.unshadowed(point.x, point.normal).is_some() {
                             let key = key.and_then(|key| key.with_light(light));
@@ -978,7 +989,7 @@ impl Visibility for Auto {
             if map.asleep {
                 known.resize(shares.len(), (Known::All, None));
             } else {
-                let place = map.key(&self.options, stage.eye, point.x, point.normal, 0);
+                let place = map.key(stage.eye, point.x, point.normal, 0);
                 if place != last {
                     last = place;
                     found.fill(None);
@@ -1296,6 +1307,12 @@ mod tests {
         sums.add(2.0, 0.0, [8.0, 8.0], [0.5, 0.25]);
         assert_eq!(sums.counted().value(), Some(2.0));
         assert_eq!(Gain::<u64>::default().value(), None);
+    }
+
+    #[test]
+    fn cells_hear_of_as_many_rays() {
+        assert_eq!([64, 256, 16, 1, 0].map(pixels_across), [4.0, 4.0, 8.0, 8.0, 8.0]);
+        assert!((pixels_across(32).powi(2) * 32.0 - 1024.0).abs() < 0.01);
     }
 
     #[test]

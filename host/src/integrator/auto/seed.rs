@@ -39,7 +39,7 @@ impl Task for Photons<'_> {
                 let [a, b, c] = stage.scene.vertices(hit.triangle);
                 let Some(normal) = (b - a).cross(c - a).try_normalize() else { continue };
                 let normal = if normal.dot(ray.direction) < 0.0 { normal } else { -normal };
-                let key = map.key(&auto.options, stage.eye, ray.at(hit.t), normal, light);
+                let key = map.key(stage.eye, ray.at(hit.t), normal, light);
                 if let Some(cell) = key.and_then(|key| view.find(key)) {
                     map.count(cell * BINS + bin(at), hit.t <= first);
                 }
