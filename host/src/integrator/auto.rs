@@ -878,7 +878,7 @@ impl Auto {
             })
             .collect();
         parts.into_par_iter().for_each(|(light, lines)| {
-            dispatch(stage.level, Photons { auto: self, map, stage, shower: &shower, light, lines });
+            dispatch(stage.level, Photons { map, stage, shower: &shower, light, lines });
         });
     }
 }

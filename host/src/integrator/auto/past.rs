@@ -394,7 +394,7 @@ mod tests {
         let learned = doubts(&pasts, &seen.variances());
         assert!(learned[0] < 0.3 && learned[1] < 0.3 && learned[2] > 0.99, "{learned:?}");
         assert_eq!(learned[3], usual[3]);
-        assert!(near(&vec![Past::default(); 4], 0).doubt(&Variances::default()) == 1.0, "not asked yet");
+        assert!(near(&[Past::default(); 4], 0).doubt(&Variances::default()) == 1.0, "not asked yet");
     }
 
     #[test]

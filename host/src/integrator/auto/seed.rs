@@ -1,7 +1,7 @@
 //! Photons that say which cells light reaches, before the first pass.
 
 use super::super::Stage;
-use super::{Auto, Map};
+use super::Map;
 use crate::photons::Shower;
 use occlude_kernel::lanes::Task;
 use occlude_kernel::occlusion_map::{BINS, bin};
@@ -10,7 +10,6 @@ use std::ops::{ControlFlow, Range};
 
 /// Photons of a light.
 pub(super) struct Photons<'a> {
-    pub(super) auto: &'a Auto,
     pub(super) map: &'a Map,
     pub(super) stage: &'a Stage<'a>,
     pub(super) shower: &'a Shower<'a>,
@@ -23,7 +22,7 @@ impl Task for Photons<'_> {
 
     #[inline(always)]
     fn run<S: Simd>(self, simd: S) {
-        let Self { auto, map, stage, shower, light, lines } = self;
+        let Self { map, stage, shower, light, lines } = self;
         let (bvh, view, clearance) = (stage.bvh.on(simd), map.view(), stage.bvh.clearance());
         let mut hits: Vec<Hit> = Vec::new();
         for line in lines {
