@@ -94,6 +94,8 @@ pub struct Auto {
     strays: Mutex<Vec<Stray>>,
     /// How far this pass' guesses are off.
     doubts: Mutex<Doubts>,
+    /// What pixels of each kind saw in it.
+    kinds: Mutex<kinds::Seen>,
     /// What was learned before.
     before: Option<SavedMap>,
     /// Whether it goes on learning where it is no help.
@@ -306,7 +308,6 @@ struct TilePast {
     pasts: Vec<Past>,
     /// Of the pass at hand.
     needs: Needs,
-    seen: kinds::Seen,
 }
 
 /// What the points of a pass need, in whole numbers, so that sums do not depend on their order.
@@ -780,7 +781,8 @@ impl Auto {
         SavedMap {
             belongs_to: fingerprint(stage),
             passes: map.passes,
-            shadow_rays: stage.shadow_rays,
+            // Of those that the size of its cells goes by.
+            shadow_rays: self.before.as_ref().map_or(stage.shadow_rays, |before| before.shadow_rays),
             doubts: map.doubts,
             kinds: map.kinds,
             cells: cells
@@ -904,7 +906,7 @@ impl Visibility for Auto {
         map.room = self.options.memory - map.remembered * each;
         if map.remembered > 0 {
             let each = |tile: &Tile| vec![Past::default(); tile.len() * map.remembered];
-            let pasts = |tile: &Tile| TilePast { pasts: each(tile), ..TilePast::default() };
+            let pasts = |tile: &Tile| TilePast { pasts: each(tile), needs: Needs::default() };
             map.pasts = tiles.iter().map(|tile| ([tile.x, tile.y], Mutex::new(pasts(tile)))).collect();
         }
         // Those of a map that was made before are as large as they were.
@@ -1227,7 +1229,9 @@ impl Visibility for Auto {
         }
         if let Some(pasts) = &mut pasts {
             pasts.needs.gain.merge(&sums.counted());
-            pasts.seen.merge(&seen);
+        }
+        if seen != kinds::Seen::default() {
+            self.kinds.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&seen);
         }
         if doubts != Doubts::default() {
             self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
@@ -1244,8 +1248,9 @@ impl Visibility for Auto {
         for tile in map.pasts.values_mut() {
             let tile = tile.get_mut().unwrap_or_else(|poisoned| poisoned.into_inner());
             needs.merge(&std::mem::take(&mut tile.needs));
-            map.kinds.merge(&std::mem::take(&mut tile.seen));
         }
+        let seen = std::mem::take(&mut *self.kinds.lock().unwrap_or_else(|poisoned| poisoned.into_inner()));
+        map.kinds.merge(&seen);
         map.variances = map.kinds.variances();
         map.scale = (map.remembered > 0).then(|| needs.scale());
         map.seen += u64::from(stage.shadow_rays);
