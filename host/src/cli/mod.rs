@@ -130,8 +130,9 @@ fn whole<T: TryFrom<u64>>(
 ) -> impl Fn(&str) -> std::result::Result<T, String> + Clone + Send + Sync + 'static {
     move |text| {
         // All digits of a seed count, and a float has not so many. 2.3M is off by rounding only.
-        let rounded = || number(text).filter(|n| (n - n.round()).abs() < 1e-6 && *n < u64::MAX as f64);
-        let value = text.parse().ok().or_else(|| Some(rounded()?.round() as u64));
+        let whole = |n: &f64| (n - n.round()).abs() <= 4.0 * f64::EPSILON * n && *n < u64::MAX as f64;
+        let rounded = || number(text).filter(whole);
+        let value = text.replace('_', "").parse().ok().or_else(|| Some(rounded()?.round() as u64));
         let value = value.filter(|value| range.contains(value)).and_then(|value| T::try_from(value).ok());
         value.ok_or_else(|| {
             format!("wants a whole number from {} to {}, like 1000 or 2.5k", range.start(), range.end())
@@ -186,7 +187,9 @@ mod tests {
         let seed = whole::<u64>(0..=u64::MAX);
         assert_eq!(seed("18446744073709551615"), Ok(u64::MAX));
         assert_eq!(seed("9007199254740993"), Ok(9_007_199_254_740_993));
-        assert!(seed("18446744073709551616").is_err());
+        assert_eq!(seed("18_446_744_073_709_551_615"), Ok(u64::MAX));
+        assert_eq!(seed("9_007_199_254_740_993"), Ok(9_007_199_254_740_993));
+        assert!(seed("18446744073709551616").is_err() && seed("1.0000005").is_err());
         assert!(whole::<u16>(0..=u64::MAX)("70000").is_err());
     }
 }
