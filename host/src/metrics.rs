@@ -147,7 +147,7 @@ pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
     });
     let ratio = |test: f64, reference: f64, spread: f64| Ratio {
         ratio: test / reference,
-        standard_error: (spread / (n - 1.0) / n).sqrt() / reference,
+        standard_error: (spread / (n - 1.0).max(1.0) / n).sqrt() / reference,
     };
 
     let mut sorted: Vec<f64> = (0..reference.pixels.len())

@@ -511,10 +511,10 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     for path in &outputs {
         output::write(path, &image, Some(&variance), args.exposure)?;
     }
-    let error = reference
-        .map(|reference| metrics::compare(&image, &reference))
-        .transpose()?
-        .map(|c| ErrorFigures { rmse: c.rmse, relmse: c.relmse, mean_ratio: c.mean_ratio_all.ratio });
+    let compared = reference.map(|reference| metrics::compare(&image, &reference)).transpose();
+    let figures = compared.as_ref().ok().and_then(Option::as_ref);
+    let error =
+        figures.map(|c| ErrorFigures { rmse: c.rmse, relmse: c.relmse, mean_ratio: c.mean_ratio_all.ratio });
     let seconds = |time: Duration| time.as_secs_f64();
     let report = Report {
         scene: scene.name.clone(),
@@ -560,6 +560,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     if let Some(path) = &args.stats {
         report.write(path)?;
     }
+    compared?;
     if !args.quiet {
         let written: Vec<String> = outputs.iter().map(|path| path.display().to_string()).collect();
         note(report.summary().trim_end());

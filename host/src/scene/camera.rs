@@ -423,7 +423,9 @@ fn keys_of(text: &[u8]) -> Vec<(String, u64)> {
                 let string = &text[start.min(text.len())..at.min(text.len())];
                 let behind = text.get(at + 1..).unwrap_or_default().trim_ascii_start();
                 if depth == 1 && behind.first() == Some(&b':') {
-                    keys.push((String::from_utf8_lossy(string).into_owned(), line));
+                    let quoted = &text[start - 1..(at + 1).min(text.len())];
+                    let key = serde_json::from_slice(quoted);
+                    keys.push((key.unwrap_or_else(|_| String::from_utf8_lossy(string).into_owned()), line));
                 }
             }
             _ => {}
@@ -498,11 +500,11 @@ mod tests {
     fn keys_have_lines_and_come_once() {
         let said = message("96,", "96,\n\"vfov_deg\" : 50,");
         assert!(said.contains("camera.json:3: `vfov_deg` stands on line 2 already"), "{said}");
-        let text = b"{\"a\": {\"b\": [1, \"c\\\"\"]},\n\"d\": \"e:\",\r\n\"f\\\\\" : {}}";
+        let text = b"{\"a\": {\"b\": [1, \"c\\\"\"]},\n\"d\": \"e:\",\r\n\"f\\\\\" : {}, \"\\u0065ye\": 1}";
         let keys = keys_of(text);
         assert_eq!(
             keys.iter().map(|(key, line)| (key.as_str(), *line)).collect::<Vec<_>>(),
-            [("a", 1), ("d", 2), ("f\\\\", 3)]
+            [("a", 1), ("d", 2), ("f\\", 3), ("eye", 3)]
         );
     }
 
