@@ -419,13 +419,12 @@ fn what_is_generated_renders() {
     assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
 }
 
+/// Runs the program, presses Ctrl-C after a while, and gives what it says then.
 #[cfg(unix)]
-#[test]
-fn interrupting_keeps_what_there_is() {
-    let folder = tempfile::tempdir().expect("a folder");
+fn interrupted(args: &[&str], folder: &Path) -> String {
     let child = Command::new(PROGRAM)
-        .args(["render", &scene("columns"), "-o", "a.png", "--spp", "100000", "--size", "96x54"])
-        .current_dir(folder.path())
+        .args(args)
+        .current_dir(folder)
         .stderr(std::process::Stdio::piped())
         .spawn()
         .expect("it starts");
@@ -435,6 +434,16 @@ fn interrupting_keeps_what_there_is() {
     let done = child.wait_with_output().expect("it ends");
     let said = text(&done.stderr);
     assert_eq!(done.status.code(), Some(1), "{said}");
+    said.into()
+}
+
+#[cfg(unix)]
+#[test]
+fn interrupting_keeps_what_there_is() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let columns = scene("columns");
+    let args = ["render", &columns, "-o", "a.png", "--spp", "100000", "--size", "96x54"];
+    let said = interrupted(&args, folder.path());
     assert!(said.contains("interrupted after"), "{said}");
     assert!(folder.path().join("a.png").exists());
 }
@@ -453,18 +462,7 @@ fn interrupting_the_first_pass_writes_nothing() {
     ] {
         // So many that no pass ends in time, and tiles of 256 pixels do.
         let long = ["--size", "1600x900", "--shadow-rays", "256", "--threads", "1"];
-        let child = Command::new(PROGRAM)
-            .args([args, &long].concat())
-            .current_dir(folder.path())
-            .stderr(std::process::Stdio::piped())
-            .spawn()
-            .expect("it starts");
-        std::thread::sleep(std::time::Duration::from_millis(1500));
-        let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
-        assert!(killed.success());
-        let done = child.wait_with_output().expect("it ends");
-        let said = text(&done.stderr);
-        assert_eq!(done.status.code(), Some(1), "{said}");
+        let said = interrupted(&[args, &long].concat(), folder.path());
         assert!(said.contains("nothing was written"), "{said}");
         assert_eq!(std::fs::read(folder.path().join("kept")).expect("the file"), b"good");
         assert_eq!(std::fs::read_dir(folder.path()).expect("the folder").count(), 2);
@@ -764,18 +762,7 @@ fn the_theory_is_reproduced() {
 #[test]
 fn an_interrupted_reproduction_leaves_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
-    let child = Command::new(PROGRAM)
-        .args(["reproduce", "theory", "-o", "a/b"])
-        .current_dir(folder.path())
-        .stderr(std::process::Stdio::piped())
-        .spawn()
-        .expect("it starts");
-    std::thread::sleep(std::time::Duration::from_millis(1500));
-    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
-    assert!(killed.success());
-    let done = child.wait_with_output().expect("it ends");
-    let said = text(&done.stderr);
-    assert_eq!(done.status.code(), Some(1), "{said}");
+    let said = interrupted(&["reproduce", "theory", "-o", "a/b"], folder.path());
     assert!(said.contains("nothing was written"), "{said}");
     assert!(!folder.path().join("a").exists());
 }
