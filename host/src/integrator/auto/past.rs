@@ -162,8 +162,7 @@ pub(super) struct Nearby {
     own: Past,
     /// As [`Past::seen_in`], of all.
     seen_in: [u64; 2],
-    /// Whether samples of a batch differed in any.
-    varied: bool,
+    kind: Kind,
 }
 
 impl Nearby {
@@ -186,7 +185,16 @@ impl Nearby {
                 varied |= near.varied > 0.0;
             }
         }
-        Some(Self { own, seen_in, varied })
+        let mut nearby = Self { own, seen_in, kind: Kind::NEW };
+        if !nearby.is_new() {
+            let state = match own.is_sure() {
+                true => usize::from(own.seen <= 0.0),
+                false => 2 + usize::from(own.varied > 0.0),
+            };
+            let around = if nearby.is_sure() { 0 } else { 1 + usize::from(varied) };
+            nearby.kind = Kind::new(state, around, own.asked);
+        }
+        Some(nearby)
     }
 
     /// Whether nothing was ever seen but all of the light, or nothing of it.
@@ -216,15 +224,7 @@ impl Nearby {
     /// What kind of pixel it is.
     #[inline(always)]
     pub(super) fn kind(&self) -> Kind {
-        if self.is_new() {
-            return Kind::NEW;
-        }
-        let state = match self.own.is_sure() {
-            true => usize::from(self.own.seen <= 0.0),
-            false => 2 + usize::from(self.own.varied > 0.0),
-        };
-        let around = if self.is_sure() { 0 } else { 1 + usize::from(self.varied) };
-        Kind::new(state, around, self.own.asked)
+        self.kind
     }
 
     /// Sums over batches of n samples: of n v (1 - v), and of n - 1.
