@@ -434,7 +434,7 @@ fn interrupted(args: &[&str], folder: &Path) -> String {
     let done = child.wait_with_output().expect("it ends");
     let said = text(&done.stderr);
     assert_eq!(done.status.code(), Some(1), "{said}");
-    said.into()
+    said
 }
 
 #[cfg(unix)]
