@@ -235,8 +235,9 @@ pub fn families(bvh: Bvh<'_>) -> Vec<On<'_>> {
     Family::all().into_iter().map(|family| On { bvh, family }).collect()
 }
 
+/// From near to far; of hits at the same `t`, and zero is the same with either sign, the lower number first.
 fn sort(hits: &mut [Hit]) {
-    hits.sort_by(|a, b| a.t.total_cmp(&b.t).then(a.triangle.cmp(&b.triangle)));
+    hits.sort_by(|a, b| a.t.partial_cmp(&b.t).expect("numbers").then(a.triangle.cmp(&b.triangle)));
 }
 
 /// A hit as bits, to compare.

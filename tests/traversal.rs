@@ -473,6 +473,22 @@ fn identical_triangles() {
 }
 
 #[test]
+fn ties_at_zero_of_either_sign() {
+    // Both triangles hold the ray's origin: one is hit at 0, the other at -0.
+    let ray = Ray::new([0.0; 3], [0.5, 0.5, 0.0], -0.5, 0.0);
+    let minus = [Vec3::new(-1.0, -1.0, -1.0), Vec3::new(0.0, -1.0, -1.0), Vec3::ZERO];
+    let plus = [Vec3::new(0.0, -1.0, -1.0), Vec3::new(0.0, 1.0, -1.0), Vec3::Z];
+    for (triangles, negative) in [(vec![minus, plus], [true, false]), (vec![plus, minus], [false, true])] {
+        let case = Case::new(triangles);
+        let signs: Vec<bool> =
+            case.oracle.hits(&ray, None).iter().map(|hit| hit.t.is_sign_negative()).collect();
+        assert_eq!(signs, negative);
+        case.check(&[ray; 16], None);
+        case.check(&[ray; 16], Some(0));
+    }
+}
+
+#[test]
 fn collinear_triangles() {
     // All along a diagonal, so that any axis sorts them alike; each tilted a little.
     let mut random = Random::new(26);
