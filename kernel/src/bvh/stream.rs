@@ -213,12 +213,15 @@ impl<S: Simd> Bvh<'_, S> {
         let (mut blocks, mut nodes) = (0, start.nodes.len());
         while free != 0 {
             let (block, node, meet);
+            // Is this the last of the given nodes?
+            let mut given = false;
             if blocks < start.blocks.len() {
                 (block, node, meet) = (Some((&start.blocks[blocks], ALL_LANES)), None, free);
                 blocks += 1;
             } else if nodes > 0 {
                 nodes -= 1;
                 (block, node, meet) = (None, Some(&start.nodes[nodes]), free);
+                given = nodes == 0;
             } else {
                 let Some((next, may)) = stack.pop() else { break };
                 meet = may & free;
@@ -235,6 +238,9 @@ impl<S: Simd> Bvh<'_, S> {
                 free &= !self.stream_at_block(stream, block, meet, part, counter, learner);
             } else if let Some(node) = node {
                 self.stream_at_node(stream, node, meet, &mut stack, part, counter);
+                if given {
+                    fullest_on_top(&mut stack);
+                }
             }
         }
         ask & !free
@@ -381,6 +387,23 @@ impl<S: Simd> Bvh<'_, S> {
                 stack.push((child, meets[place]));
             }
         }
+    }
+}
+
+/// Puts what most rays may meet on top; where about as many do, by powers of two, the order stays.
+#[inline(always)]
+fn fullest_on_top(stack: &mut Waiting) {
+    let mut k = 1;
+    while k < stack.len() {
+        let this = stack[k];
+        let rays = this.1.count_ones().checked_ilog2();
+        let mut slot = k;
+        while slot > 0 && stack[slot - 1].1.count_ones().checked_ilog2() > rays {
+            stack[slot] = stack[slot - 1];
+            slot -= 1;
+        }
+        stack[slot] = this;
+        k += 1;
     }
 }
 

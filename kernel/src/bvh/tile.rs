@@ -91,6 +91,25 @@ struct Cut {
 struct Entry {
     child: Child,
     bounds: [[f32; 3]; 2],
+    path: Path,
+}
+
+/// The places from the top of the tree on, the first in the highest bits: paths are ordered as subtrees are when the first
+/// child always comes first, but for those too far down to be told apart.
+#[derive(Clone, Copy)]
+struct Path {
+    places: u64,
+    /// Where the next place goes.
+    shift: u32,
+}
+
+impl Path {
+    const TOP: Self = Self { places: 0, shift: 60 };
+
+    #[inline(always)]
+    fn below(self, place: usize) -> Self {
+        Self { places: self.places | (place as u64) << self.shift, shift: self.shift.saturating_sub(3) }
+    }
 }
 
 /// Subtrees a shaft keeps track of.
@@ -100,7 +119,7 @@ impl Cut {
     const NOTHING: Self = Self {
         nodes: [Node::EMPTY; CUT / Node::WIDTH],
         count: 0,
-        queue: [Entry { child: Child::NONE, bounds: [[0.0; 3]; 2] }; QUEUE],
+        queue: [Entry { child: Child::NONE, bounds: [[0.0; 3]; 2], path: Path::TOP }; QUEUE],
     };
 
     /// The nodes in use.
@@ -836,7 +855,7 @@ impl<S: Simd> Bvh<'_, S> {
     fn whole(&self, cut: &mut Cut) {
         cut.count = 0;
         let most = self.magnitude;
-        cut.push(&Entry { child: Child::node(0), bounds: [[-most; 3], [most; 3]] });
+        cut.push(&Entry { child: Child::node(0), bounds: [[-most; 3], [most; 3]], path: Path::TOP });
     }
 
     /// Puts the children of a node that the shaft meets into the queue. False if there is no room for them.
@@ -847,6 +866,7 @@ impl<S: Simd> Bvh<'_, S> {
         node: &Node,
         cut: &mut Cut,
         len: &mut usize,
+        path: Path,
         counter: &mut impl Counter,
     ) -> bool {
         counter.node_tests(node.len());
@@ -862,7 +882,7 @@ impl<S: Simd> Bvh<'_, S> {
             }
             let [[a, b, c], [d, e, f]] = &node.bounds;
             let bounds = [[a[place], b[place], c[place]], [d[place], e[place], f[place]]];
-            cut.queue[*len] = Entry { child: node.children[place], bounds };
+            cut.queue[*len] = Entry { child: node.children[place], bounds, path: path.below(place) };
             *len += 1;
         }
         true
@@ -939,7 +959,7 @@ impl<S: Simd> Bvh<'_, S> {
         let mut done = 0;
         while done < roots.len() {
             // At most sixteen children, for which there is room.
-            self.enqueue(shaft, &roots[done], cut, &mut len, counter);
+            self.enqueue(shaft, &roots[done], cut, &mut len, Path::TOP.below(done), counter);
             done += 1;
         }
         // How far the queue had come when it was last short enough for a cut, and the list empty.
@@ -954,13 +974,13 @@ impl<S: Simd> Bvh<'_, S> {
             if done > steps {
                 break;
             }
-            let next = cut.queue[head].child;
+            let Entry { child: next, path, .. } = cut.queue[head];
             head += 1;
             done += 1;
             let enough = if next.is_leaf() {
                 list.take(shaft, self.simd, (&self.blocks[next.block()], next.bits()), room, counter)
             } else {
-                self.enqueue(shaft, &self.nodes[next.index()], cut, &mut len, counter)
+                self.enqueue(shaft, &self.nodes[next.index()], cut, &mut len, path, counter)
             };
             if !enough {
                 break;
@@ -969,20 +989,18 @@ impl<S: Simd> Bvh<'_, S> {
         // A list that is not all there is would be asked for nothing as often as not.
         let (head, len) = saved;
         list.count = 0;
-        // The largest come first: they are likeliest to block many rays.
-        let mut order = ArrayVec::<(f32, usize), CUT>::new();
+        // In the tree's order, which puts first what is likeliest to block for the work that it takes.
+        let mut order = ArrayVec::<(u64, usize), CUT>::new();
         let mut k = head;
         while k < len {
-            let [lower, upper] = cut.queue[k].bounds;
-            let d = Vec3::from(upper) - Vec3::from(lower);
-            let size = d.x * d.y + d.y * d.z + d.z * d.x;
+            let places = cut.queue[k].path.places;
             let mut slot = order.len();
-            order.push((size, k));
-            while slot > 0 && order[slot - 1].0 < size {
+            order.push((places, k));
+            while slot > 0 && order[slot - 1].0 > places {
                 order[slot] = order[slot - 1];
                 slot -= 1;
             }
-            order[slot] = (size, k);
+            order[slot] = (places, k);
             k += 1;
         }
         let mut k = 0;
