@@ -35,17 +35,10 @@ struct Sides<'s, L> {
 impl<'s, L: Lanes> Sides<'s, L> {
     #[inline(always)]
     fn new(token: L::Token, shaft: &'s Shaft) -> Self {
-        let mut lanes = [[0.0; 8]; 3];
-        let mut k = 0;
-        while k < 8 {
-            let corner = shaft.corners[k];
-            (lanes[0][k], lanes[1][k], lanes[2][k]) = (corner.x, corner.y, corner.z);
-            k += 1;
-        }
         let mut corners = [vec3x::splat(token, [0.0; 3]); 8];
         let mut k = 0;
         while k * L::WIDTH < 8 {
-            corners[k] = vec3x::load(token, &lanes, k * L::WIDTH);
+            corners[k] = vec3x::load(token, &shaft.corners, k * L::WIDTH);
             k += 1;
         }
         let [near, far] = shaft.farthest;

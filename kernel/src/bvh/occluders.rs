@@ -130,7 +130,7 @@ impl Pairs {
         let mut corners = [8, 8];
         let mut side = 0;
         while side < 2 {
-            let thickness = (shaft.corners[8 * side] - shaft.corners[8 * side + 4]).length();
+            let thickness = (shaft.corner(8 * side) - shaft.corner(8 * side + 4)).length();
             if thickness <= TURNED_MARGIN * reach {
                 corners[side] = 4;
                 margin += thickness;
@@ -143,8 +143,8 @@ impl Pairs {
         while i < corners[0] {
             let mut k = 0;
             while k < corners[1] {
-                let from = shaft.reference + shaft.corners[i];
-                let along = shaft.corners[8 + k] - shaft.corners[i];
+                let from = shaft.reference + shaft.corner(i);
+                let along = shaft.corner(8 + k) - shaft.corner(i);
                 let n = pairs.count;
                 (pairs.origin[0][n], pairs.origin[1][n], pairs.origin[2][n]) = (from.x, from.y, from.z);
                 (direction[0][n], direction[1][n], direction[2][n]) = (along.x, along.y, along.z);
@@ -360,7 +360,7 @@ impl<S: Simd> Bvh<'_, S> {
         let reach =
             self.magnitude + shaft.reference.abs().max_element() + shaft.farthest[0].max(shaft.farthest[1]);
         // Such a box stands also between their middles.
-        let middle = shaft.reference + (shaft.corners[0] + shaft.corners[7]) * 0.5;
+        let middle = shaft.reference + (shaft.corner(0) + shaft.corner(7)) * 0.5;
         let origin = vec3x::splat::<N<S>>(token, middle.to_array());
         let (inverse, sound) = invert::<N<S>>(token, vec3x::splat::<N<S>>(token, shaft.between.to_array()));
         if !sound.any() {

@@ -8,11 +8,10 @@
 //! Shafts go back to Haines and Wallace, "Shaft Culling for Efficient Ray-Traced Radiosity" (Eurographics
 //! Workshop on Rendering 1991).
 
-use super::pyramid::{Plane, extent};
 use super::{FARTHEST, NEAREST, Node, ROUNDING};
 use crate::lanes::{Lanes, Mask, Simd};
 use crate::triangle::TriangleBlock;
-use crate::vec3x;
+use crate::vec3x::{self, Vec3x};
 use glam::Vec3;
 
 /// A box turned any way, from a reference point: its middle and its half axes.
@@ -69,13 +68,17 @@ impl<L: Lanes> Around<L> {
 }
 
 impl Turned {
+    /// The greatest distance along each axis of the corners from the reference, or a little more.
     #[inline(always)]
-    fn corner(&self, index: usize) -> Vec3 {
+    fn reach(&self) -> Vec3 {
+        self.middle.abs() + self.spread()
+    }
+
+    /// The same from the middle.
+    #[inline(always)]
+    fn spread(&self) -> Vec3 {
         let [a, b, c] = self.axes;
-        self.middle
-            + if index & 1 == 0 { a } else { -a }
-            + if index & 2 == 0 { b } else { -b }
-            + if index & 4 == 0 { c } else { -c }
+        a.abs() + b.abs() + c.abs()
     }
 
     /// The greatest of a linear function over the box.
@@ -90,18 +93,126 @@ impl Turned {
         let [a, b, c] = self.axes;
         normal.dot(self.middle) - normal.dot(a).abs() - normal.dot(b).abs() - normal.dot(c).abs()
     }
+}
 
-    /// The corner that is least.
+/// A box a lane.
+struct Boxes<L> {
+    middle: Vec3x<L>,
+    axes: [Vec3x<L>; 3],
+}
+
+impl<L: Lanes> Boxes<L> {
+    /// One of two boxes in each lane, as the weights say.
     #[inline(always)]
-    fn least_corner(&self, normal: Vec3) -> Vec3 {
-        let [a, b, c] = self.axes;
-        let toward = |axis: Vec3| if normal.dot(axis) > 0.0 { -axis } else { axis };
-        self.middle + toward(a) + toward(b) + toward(c)
+    fn either(token: L::Token, boxes: [&Turned; 2], weights: [L; 2]) -> Self {
+        let [a, b] = boxes;
+        Self {
+            middle: either(token, [a.middle, b.middle], weights),
+            axes: [
+                either(token, [a.axes[0], b.axes[0]], weights),
+                either(token, [a.axes[1], b.axes[1]], weights),
+                either(token, [a.axes[2], b.axes[2]], weights),
+            ],
+        }
+    }
+
+    /// The corner where a linear function is least.
+    #[inline(always)]
+    fn least_corner(&self, token: L::Token, normal: Vec3x<L>) -> Vec3x<L> {
+        let mut corner = self.middle;
+        let mut k = 0;
+        while k < 3 {
+            let up = L::splat(token, 0.0).lt(vec3x::dot(normal, self.axes[k]));
+            let mut axis = 0;
+            while axis < 3 {
+                let step = self.axes[k][axis];
+                corner[axis] = corner[axis] + L::select(up, -step, step);
+                axis += 1;
+            }
+            k += 1;
+        }
+        corner
     }
 }
 
+/// Sums of vectors, weighted lane by lane.
+#[inline(always)]
+fn either<L: Lanes, const N: usize>(token: L::Token, vectors: [Vec3; N], weights: [L; N]) -> Vec3x<L> {
+    let mut sum = vec3x::splat(token, [0.0; 3]);
+    let mut k = 0;
+    while k < N {
+        let [x, y, z] = vec3x::splat::<L>(token, vectors[k].to_array());
+        sum = [x.mul_add(weights[k], sum[0]), y.mul_add(weights[k], sum[1]), z.mul_add(weights[k], sum[2])];
+        k += 1;
+    }
+    sum
+}
+
+/// Weights of lanes from the `from`th on.
+#[inline(always)]
+fn weights<L: Lanes, const N: usize>(token: L::Token, lanes: &[[f32; 8]; N], from: usize) -> [L; N] {
+    let mut weights = [L::splat(token, 0.0); N];
+    let mut k = 0;
+    while k < N {
+        weights[k] = L::load(token, &lanes[k][from..]);
+        k += 1;
+    }
+    weights
+}
+
+/// The least of a linear function over a box, by lane.
+#[inline(always)]
+fn least<L: Lanes>(token: L::Token, turned: &Turned, normal: Vec3x<L>) -> L {
+    let [a, b, c] = turned.axes;
+    vec3x::dot(normal, vec3x::splat(token, turned.middle.to_array()))
+        - vec3x::dot(normal, vec3x::splat(token, a.to_array())).abs()
+        - vec3x::dot(normal, vec3x::splat(token, b.to_array())).abs()
+        - vec3x::dot(normal, vec3x::splat(token, c.to_array())).abs()
+}
+
+/// Where `normal` leads to the positive side of `side`, it is turned about.
+#[inline(always)]
+fn turned_from<L: Lanes>(token: L::Token, normal: Vec3x<L>, side: Vec3x<L>) -> Vec3x<L> {
+    let up = L::splat(token, 0.0).lt(vec3x::dot(normal, side));
+    [
+        L::select(up, -normal[0], normal[0]),
+        L::select(up, -normal[1], normal[1]),
+        L::select(up, -normal[2], normal[2]),
+    ]
+}
+
+/// The lengths of normals, as sums of components, that planes are made of.
+const SIZES: [f32; 2] = [1e-30, 1e30];
+
 /// Facets along an edge of either box, and two faces.
 const PLANES: usize = 10;
+
+/// The first eight planes, of which four have an edge of the targets' box and four one of the points'.
+const OF: [[f32; 8]; 2] =
+    [[1.0, 1.0, 1.0, 1.0, 0.0, 0.0, 0.0, 0.0], [0.0, 0.0, 0.0, 0.0, 1.0, 1.0, 1.0, 1.0]];
+
+/// Their edges: along the first axis of the targets' box, its second, and the same of the points'.
+const EDGE: [[f32; 8]; 4] = [
+    [1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    [0.0, 1.0, 0.0, 1.0, 0.0, 0.0, 0.0, 0.0],
+    [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0, 0.0],
+    [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0],
+];
+
+/// Where the edges lie, from the middle of the box, along the same four axes.
+const SIDE: [[f32; 8]; 4] = [
+    [0.0, 1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0],
+    [1.0, 0.0, -1.0, 0.0, 0.0, 0.0, 0.0, 0.0],
+    [0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0],
+    [0.0, 0.0, 0.0, 0.0, 1.0, 0.0, -1.0, 0.0],
+];
+
+/// To which side of a box's middle its corners lie, by axis of the box.
+const CORNER: [[f32; 8]; 3] = [
+    [1.0, -1.0, 1.0, -1.0, 1.0, -1.0, 1.0, -1.0],
+    [1.0, 1.0, -1.0, -1.0, 1.0, 1.0, -1.0, -1.0],
+    [1.0, 1.0, 1.0, 1.0, -1.0, -1.0, -1.0, -1.0],
+];
 
 /// Where anything must be to come between the points and the targets.
 pub(super) struct Shaft {
@@ -112,88 +223,132 @@ pub(super) struct Shaft {
     /// The boxes themselves, from the reference.
     pub(super) points: Turned,
     pub(super) targets: Turned,
-    planes: [Plane; PLANES],
+    planes: Planes,
     lower: Vec3,
     upper: Vec3,
     /// Eight around the points and eight around the targets; `k` and `k ^ 4` are where a flat box is thin.
-    pub(super) corners: [Vec3; 16],
-    /// The greatest component of a corner around the points, and around the targets.
+    pub(super) corners: [[f32; 16]; 3],
+    /// The greatest component of a corner around the points, and around the targets, or a little more.
     pub(super) farthest: [f32; 2],
+}
+
+/// Planes with `normal . position + offset >= 0` where the shaft may be.
+struct Planes {
+    normal: [[f32; PLANES]; 3],
+    offset: [f32; PLANES],
+}
+
+impl Planes {
+    /// How far inside of a plane the corners of boxes are that are farthest inside.
+    #[inline(always)]
+    fn most<L: Lanes>(&self, token: L::Token, k: usize, bounds: &[Vec3x<L>; 2]) -> L {
+        let mut at = L::splat(token, self.offset[k]);
+        let mut axis = 0;
+        while axis < 3 {
+            let normal = self.normal[axis][k];
+            at = bounds[usize::from(normal > 0.0)][axis].mul_add(L::splat(token, normal), at);
+            axis += 1;
+        }
+        at
+    }
+
+    /// How far inside of a plane positions are.
+    #[inline(always)]
+    fn at<L: Lanes>(&self, token: L::Token, k: usize, [x, y, z]: Vec3x<L>) -> L {
+        let [a, b, c] = vec3x::broadcast::<L, PLANES>(token, &self.normal, k);
+        x.mul_add(a, y.mul_add(b, z.mul_add(c, L::splat(token, self.offset[k]))))
+    }
 }
 
 impl Shaft {
     /// Around two boxes, both from `reference`. `magnitude` bounds every coordinate of the scene. `None` where
     /// anything is not finite, or too far away for the planes.
     #[inline(always)]
-    pub(super) fn new(reference: Vec3, points: &Turned, targets: &Turned, magnitude: f32) -> Option<Self> {
+    pub(super) fn new<S: Simd>(
+        simd: S,
+        reference: Vec3,
+        points: &Turned,
+        targets: &Turned,
+        magnitude: f32,
+    ) -> Option<Self> {
+        let token = simd.token();
         let reach = magnitude + reference.abs().max_element();
         let position = 16.0 * ROUNDING * reach;
-        let mut corners = [Vec3::ZERO; 16];
-        let (mut lower, mut upper) = (Vec3::INFINITY, Vec3::NEG_INFINITY);
-        let mut farthest = [0.0f32; 2];
-        // Not finite if any corner is not; the least and the greatest may lose what is not a number.
-        let mut sum = Vec3::ZERO;
-        let mut k = 0;
-        while k < 16 {
-            let corner = if k < 8 { points.corner(k) } else { targets.corner(k & 7) };
-            (lower, upper) = (lower.min(corner), upper.max(corner));
-            corners[k] = corner;
-            sum += corner;
-            farthest[k / 8] = farthest[k / 8].max(corner.abs().max_element());
-            k += 1;
-        }
+        let [near, far] = [points.reach(), targets.reach()];
+        let farthest = [near.max_element(), far.max_element()];
         let most = farthest[0].max(farthest[1]).max(reference.abs().max_element());
-        // Written so that NaN fails.
-        if !(sum.is_finite() && most < FARTHEST && reach > NEAREST) {
+        // Written so that NaN fails; of NaN and a number the greater may be the number.
+        if !((near + far).is_finite() && most < FARTHEST && reach > NEAREST) {
             return None;
         }
-        let mut planes = [Plane::default(); PLANES];
-        let mut count = 0;
-        // Facets through an edge of one box and the corner of the other that lies farthest out. The boxes are flat
-        // as a rule, so two of the axes matter.
-        let mut turn = 0;
-        while turn < 2 {
-            let (this, other) = if turn == 0 { (targets, points) } else { (points, targets) };
-            let mut k = 0;
-            while k < 4 {
-                let (edge, side) = (this.axes[k & 1], this.axes[(k & 1) ^ 1]);
-                let side = if k < 2 { side } else { -side };
-                let at = this.middle + side;
-                let mut normal = edge.cross(at - other.middle);
-                let mut step = 0;
-                while step < 2 {
-                    if normal.dot(side) > 0.0 {
-                        normal = -normal;
-                    }
-                    if step == 0 {
-                        normal = edge.cross(at - other.least_corner(normal));
-                    }
-                    step += 1;
-                }
-                planes[count] = Self::plane(reference, normal, points, targets, position);
-                count += 1;
-                k += 1;
+        let mut corners = [[0.0; 16]; 3];
+        let mut planes = Planes { normal: [[0.0; PLANES]; 3], offset: [0.0; PLANES] };
+        let mut from = 0;
+        while from < 8 {
+            let signs = weights::<S::Node, 3>(token, &CORNER, from);
+            let mut side = 0;
+            while side < 2 {
+                let turned = if side == 0 { points } else { targets };
+                let [x, y, z] = vec3x::splat::<S::Node>(token, turned.middle.to_array());
+                let [a, b, c] = either(token, turned.axes, signs);
+                (x + a).store(&mut corners[0][8 * side + from..]);
+                (y + b).store(&mut corners[1][8 * side + from..]);
+                (z + c).store(&mut corners[2][8 * side + from..]);
+                side += 1;
             }
-            turn += 1;
+            // Facets through an edge of one box and the corner of the other that lies farthest out. The boxes are flat
+            // as a rule, so two of the axes matter.
+            let axes = [targets.axes[0], targets.axes[1], points.axes[0], points.axes[1]];
+            let edge = either(token, axes, weights::<S::Node, 4>(token, &EDGE, from));
+            let side = either(token, axes, weights::<S::Node, 4>(token, &SIDE, from));
+            let of = weights::<S::Node, 2>(token, &OF, from);
+            let [x, y, z] = either(token, [targets.middle, points.middle], of);
+            let at = [x + side[0], y + side[1], z + side[2]];
+            let other = Boxes::either(token, [points, targets], of);
+            let normal = vec3x::cross(edge, vec3x::sub(at, other.middle));
+            let normal = turned_from(token, normal, side);
+            let corner = other.least_corner(token, normal);
+            let normal = turned_from(token, vec3x::cross(edge, vec3x::sub(at, corner)), side);
+            // A normal of next to no length culls nothing.
+            let size = normal[0].abs() + normal[1].abs() + normal[2].abs();
+            let fit = S::Node::splat(token, SIZES[0]).lt(size) & size.lt(S::Node::splat(token, SIZES[1]));
+            let zero = S::Node::splat(token, 0.0);
+            let by_size = S::Node::splat(token, 1.0) / size;
+            let normal = [
+                S::Node::select(fit, normal[0] * by_size, zero),
+                S::Node::select(fit, normal[1] * by_size, zero),
+                S::Node::select(fit, normal[2] * by_size, zero),
+            ];
+            let least = least(token, points, normal).min(least(token, targets, normal));
+            let back = vec3x::dot(normal, vec3x::splat(token, reference.to_array()));
+            let offset = (-least - back) + S::Node::splat(token, 4.0 * position);
+            normal[0].store(&mut planes.normal[0][from..]);
+            normal[1].store(&mut planes.normal[1][from..]);
+            normal[2].store(&mut planes.normal[2][from..]);
+            S::Node::select(fit, offset, zero).store(&mut planes.offset[from..]);
+            from += S::Node::WIDTH;
         }
         let between = targets.middle - points.middle;
-        let face = |normal: Vec3, toward: Vec3| if normal.dot(toward) < 0.0 { -normal } else { normal };
-        planes[8] = Self::plane(
-            reference,
-            face(points.axes[0].cross(points.axes[1]), between),
-            points,
-            targets,
-            position,
-        );
-        planes[9] = Self::plane(
-            reference,
-            face(targets.axes[0].cross(targets.axes[1]), -between),
-            points,
-            targets,
-            position,
-        );
+        let mut side = 0;
+        while side < 2 {
+            let ([a, b, _], toward) =
+                if side == 0 { (points.axes, between) } else { (targets.axes, -between) };
+            let normal = a.cross(b);
+            let size = normal.abs().element_sum();
+            if size > SIZES[0] && size < SIZES[1] {
+                let normal = normal * (if normal.dot(toward) < 0.0 { -1.0 } else { 1.0 } / size);
+                let least = points.least(normal).min(targets.least(normal));
+                let k = 8 + side;
+                (planes.normal[0][k], planes.normal[1][k], planes.normal[2][k]) = normal.into();
+                planes.offset[k] = (-least - normal.dot(reference)) + 4.0 * position;
+            }
+            side += 1;
+        }
         // Positions are rounded when they are counted from the reference, and again when the result is moved back.
         let slack = Vec3::splat(4.0 * position);
+        let (here, there) = (points.spread(), targets.spread());
+        let lower = (points.middle - here).min(targets.middle - there);
+        let upper = (points.middle + here).max(targets.middle + there);
         let (lower, upper) = (reference + lower - slack, reference + upper + slack);
         Some(Self {
             reference,
@@ -208,16 +363,10 @@ impl Shaft {
         })
     }
 
-    /// Both boxes are on the positive side. A normal of next to no length culls nothing.
+    /// A corner, as in `corners`.
     #[inline(always)]
-    fn plane(reference: Vec3, normal: Vec3, points: &Turned, targets: &Turned, position: f32) -> Plane {
-        let size = extent(normal);
-        if !(size > 1e-30 && size < 1e30) {
-            return Plane::default();
-        }
-        let normal = normal / size;
-        let least = points.least(normal).min(targets.least(normal));
-        Plane::new(normal, -least, reference, 4.0 * position)
+    pub(super) fn corner(&self, k: usize) -> Vec3 {
+        Vec3::new(self.corners[0][k], self.corners[1][k], self.corners[2][k])
     }
 
     /// Which children of a node the shaft may meet.
@@ -241,11 +390,7 @@ impl Shaft {
             if inside.any() {
                 let mut k = 0;
                 while k < PLANES {
-                    let plane = &self.planes[k];
-                    let x = bounds[plane.side[0] & 1][0];
-                    let y = bounds[plane.side[1] & 1][1];
-                    let z = bounds[plane.side[2] & 1][2];
-                    inside = inside & zero.le(plane.at::<N<S>>(token, [x, y, z]));
+                    inside = inside & zero.le(self.planes.most(token, k, &bounds));
                     k += 1;
                 }
             }
@@ -274,8 +419,8 @@ impl Shaft {
             inside = inside & lower[2].le(a[2].max(b[2]).max(c[2])) & a[2].min(b[2]).min(c[2]).le(upper[2]);
             let mut k = 0;
             while k < PLANES && inside.any() {
-                let plane = &self.planes[k];
-                let at = plane.at(token, a).max(plane.at(token, b)).max(plane.at(token, c));
+                let at = self.planes.at(token, k, a);
+                let at = at.max(self.planes.at(token, k, b)).max(self.planes.at(token, k, c));
                 inside = inside & zero.le(at);
                 k += 1;
             }
@@ -314,7 +459,7 @@ impl Shaft {
             let bound = rounding * (far + S::Node::splat(token, 2.0 * self.farthest[side]));
             let mut k = 8 * side;
             while k < 8 * side + 8 {
-                let [x, y, z] = vec3x::splat::<S::Node>(token, self.corners[k].to_array());
+                let [x, y, z] = vec3x::broadcast::<S::Node, 16>(token, &self.corners, k);
                 let at = n[0].mul_add(x, n[1].mul_add(y, n[2] * z));
                 (low, high) = (low.min(at - bound), high.max(at + bound));
                 k += 1;

@@ -19,7 +19,7 @@ use super::{ALL_LANES, Bvh, CUT, Child, Node, Occluders, Part, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
 use crate::triangle::{NO_TRIANGLE, TriangleBlock};
-use crate::vec3x;
+use crate::vec3x::{self, Vec3x};
 use arrayvec::ArrayVec;
 use glam::Vec3;
 
@@ -666,15 +666,7 @@ impl<S: Simd> Bvh<'_, S> {
         stream.clear();
         let mut from = 0;
         while from < points.len() {
-            let mut lanes = [[0.0; 16]; 3];
-            let mut lane = 0;
-            while lane < S::Packet::WIDTH {
-                // The last point once more in the lanes beyond it.
-                let [x, y, z] = points[(from + lane).min(points.len() - 1)].x;
-                (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (x, y, z);
-                lane += 1;
-            }
-            let origin = vec3x::load(token, &lanes, 0);
+            let origin = points_from(token, points, from);
             let ends = targets_from::<S>(token, targets, first + from, first + points.len());
             let rays = Rays {
                 origin,
@@ -819,14 +811,14 @@ impl<S: Simd> Bvh<'_, S> {
                 i += P::<S>::WIDTH;
             }
         }
-        Shaft::new(reference, &here, &there.finish(), self.magnitude)
+        Shaft::new(self.simd, reference, &here, &there.finish(), self.magnitude)
     }
 
     /// The shaft of some of the points.
     #[inline(always)]
     fn narrower(&self, shaft: &Shaft, points: &[TilePoint]) -> Option<Shaft> {
         let here = self.around(points, shaft.reference, frame_of_points(points));
-        Shaft::new(shaft.reference, &here, &shaft.targets, self.magnitude)
+        Shaft::new(self.simd, shaft.reference, &here, &shaft.targets, self.magnitude)
     }
 
     /// A box around points, from the reference.
@@ -836,15 +828,8 @@ impl<S: Simd> Bvh<'_, S> {
         let mut here = Around::<S::Packet>::new(token, frame);
         let mut k = 0;
         while k < points.len() {
-            let mut lanes = [[0.0; 16]; 3];
-            let mut lane = 0;
-            while lane < S::Packet::WIDTH {
-                // The last point once more in the lanes beyond it.
-                let at = Vec3::from(points[(k + lane).min(points.len() - 1)].x) - reference;
-                (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (at.x, at.y, at.z);
-                lane += 1;
-            }
-            here.add(token, vec3x::load(token, &lanes, 0));
+            let origin = vec3x::splat::<S::Packet>(token, reference.to_array());
+            here.add(token, vec3x::sub(points_from(token, points, k), origin));
             k += S::Packet::WIDTH;
         }
         here.finish()
@@ -1086,6 +1071,29 @@ pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
     let third = normal.cross(edge);
     let size = third.length_squared();
     if size > 0.25 && size < 2.0 { [edge, third, normal] } else { [Vec3::X, Vec3::Y, Vec3::Z] }
+}
+
+/// Points from the `from`th on, one a lane; the last of all once more in the lanes beyond it.
+#[inline(always)]
+pub(super) fn points_from<L: Lanes>(token: L::Token, points: &[TilePoint], from: usize) -> Vec3x<L> {
+    let points = &points[from..];
+    let mut lanes = [[0.0; 16]; 3];
+    let mut lane = 0;
+    if points.len() >= L::WIDTH {
+        let points = &points[..L::WIDTH];
+        while lane < L::WIDTH {
+            let x = points[lane].x;
+            (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (x[0], x[1], x[2]);
+            lane += 1;
+        }
+        return vec3x::load(token, &lanes, 0);
+    }
+    while lane < L::WIDTH {
+        let x = points[lane.min(points.len() - 1)].x;
+        (lanes[0][lane], lanes[1][lane], lanes[2][lane]) = (x[0], x[1], x[2]);
+        lane += 1;
+    }
+    vec3x::load(token, &lanes, 0)
 }
 
 /// The targets of points from the `k`th on that follow each other; `k` becomes the first point that breaks off.
