@@ -139,6 +139,16 @@ impl<L: Lanes> Turn<L> {
         }
     }
 
+    /// By the longest axis of each direction, which most often is the same for all.
+    #[inline(always)]
+    pub(crate) fn of(direction: Vec3x<L>) -> Self {
+        let each = Self::each(direction);
+        let Self::Each([first, second]) = each else { return each };
+        let all = u32::MAX >> (32 - L::WIDTH);
+        let (first, second) = (first.bits(), second.bits());
+        Self::same([first, second & !first, all & !(first | second)], all).unwrap_or(each)
+    }
+
     /// By the longest axis of each direction: the rule of [`Axes::dominant`].
     #[inline(always)]
     pub(crate) fn each(direction: Vec3x<L>) -> Self {
@@ -148,7 +158,7 @@ impl<L: Lanes> Turn<L> {
 
     /// The components of a vector along x, y and z.
     #[inline(always)]
-    fn of(&self, [x, y, z]: Vec3x<L>) -> Vec3x<L> {
+    fn turn(&self, [x, y, z]: Vec3x<L>) -> Vec3x<L> {
         match *self {
             Self::Same(axes) => [[x, y, z][axes.x], [x, y, z][axes.y], [x, y, z][axes.z]],
             Self::Each([first, second]) => [
@@ -250,9 +260,9 @@ impl<L: Lanes> Sheared<L> {
         t_min: L,
         t_max: L,
     ) -> Self {
-        let [x, y, z] = turn.of(direction);
+        let [x, y, z] = turn.turn(direction);
         let step = L::splat(token, 1.0) / z;
-        let turned = turn.of(origin);
+        let turned = turn.turn(origin);
         Self { turn, turned, origin, direction, shear: [x * step, y * step, step], t_min, t_max }
     }
 
@@ -265,7 +275,7 @@ impl<L: Lanes> Sheared<L> {
                 triangle.at(token, vertex, axes.y),
                 triangle.at(token, vertex, axes.z),
             ],
-            Turn::Each(_) => self.turn.of(triangle.vertex(token, vertex)),
+            Turn::Each(_) => self.turn.turn(triangle.vertex(token, vertex)),
         };
         let [x, y, depth] = vec3x::sub(at, self.turned);
         [x - self.shear[0] * depth, y - self.shear[1] * depth, depth]

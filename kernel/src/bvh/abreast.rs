@@ -297,7 +297,7 @@ impl<S: Simd> Bvh<'_, S> {
             if asked != 0 {
                 let direction =
                     vec3x::sub(targets_from::<S>(token, targets, first + i, first + count), origin);
-                let turn = Turn::each(direction);
+                let turn = Turn::of(direction);
                 let sheared = Sheared::new(token, turn, origin, direction, begin, end);
                 blocked |= (u64::from(sheared.cross(token, Single { block, lane }).hit.bits()) & asked) << i;
             }

@@ -213,7 +213,7 @@ impl Ends {
 pub(super) const FEW_AT_NODE: u32 = 4;
 
 /// The same with the triangles of a block.
-pub(super) const FEW_AT_BLOCK: u32 = 3;
+pub(super) const FEW_AT_BLOCK: u32 = 5;
 
 /// The 8 by 8 bits of a word, rows as columns.
 #[inline(always)]
