@@ -88,8 +88,11 @@ fn trial(random: &mut Random, each: usize) -> [usize; 2] {
     let place = random.point() * (scale * random.any_scale(-1.0, 3.0));
     let mut triangles = blockers(random, away, size);
     // The surface the points lie on, flat or round.
-    let (a, b) = random.direction().any_orthonormal_pair();
-    let spread = scale * random.any_scale(-3.0, -0.5);
+    let (a, b) = match random.below(4) {
+        0 => [(Vec3::X, Vec3::Y), (Vec3::Y, Vec3::Z), (Vec3::Z, Vec3::X)][random.below(3)],
+        _ => random.direction().any_orthonormal_pair(),
+    };
+    let spread = scale * random.any_scale(-3.0, 0.3);
     let round = if random.below(2) == 0 { 0.0 } else { random.between(0.0, 2.0) };
     let normal = if a.cross(b).dot(away) < 0.0 { b.cross(a) } else { a.cross(b) };
     let ground = |x: f32, y: f32| (a * x + b * y - normal * (round * (x * x + y * y))) * spread;
@@ -101,6 +104,12 @@ fn trial(random: &mut Random, each: usize) -> [usize; 2] {
             triangles.extend([[p, q, r], [p, r, s]]);
         }
     }
+    // The light's own surface, and points that are not as far off theirs as they should be.
+    if random.below(3) == 0 {
+        let [p, q, r, s] = [[0.0, 0.0], [1.0, 0.0], [1.0, 1.0], [0.0, 1.0]].map(|[s, t]| light.at(s, t));
+        triangles.extend([[p, q, r], [p, r, s]]);
+    }
+    let height = [1.0, 1.0, 1.0, 0.3, 0.1, 0.0][random.below(6)];
     triangles.iter_mut().flatten().for_each(|vertex| *vertex += place);
     let accel = Accel::from_triangles(&triangles, Quality::Medium);
     let bvh = accel.bvh();
@@ -112,7 +121,7 @@ fn trial(random: &mut Random, each: usize) -> [usize; 2] {
     for row in 0..edge {
         for column in 0..edge {
             let [x, y] = [column, row].map(|k| (k as f32 + random.unit()) / edge as f32 * 2.0 - 1.0);
-            let x = offset(ground(x, y) + place, normal, clearance);
+            let x = offset(ground(x, y) + place, normal, clearance * height);
             points.push(TilePoint { x: x.into(), first: ends.len() as u32, count: each as u32 });
             for _ in 0..each {
                 let y = light.at(random.unit(), random.unit()) + place;

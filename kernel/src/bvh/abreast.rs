@@ -425,23 +425,25 @@ impl<L: Lanes> Views<L> {
         let (e, f) = (q - p, r - p);
         let normal = e.cross(f);
         let (e, f) = (e.abs(), f.abs());
-        let size = (e.y * f.z + e.z * f.y) + (e.z * f.x + e.x * f.z) + (e.x * f.y + e.y * f.x);
+        let sizes = Vec3::new(e.y * f.z + e.z * f.y, e.z * f.x + e.x * f.z, e.x * f.y + e.y * f.x);
         let from = |v: Vec3| (v - flat.reference).abs().max_element();
         let far = flat.near + from(p).max(from(q)).max(from(r)).max(flat.far);
         let thick = 0.5 * (flat.greatest[2] - flat.least[2]) * normal.dot(flat.normal).abs();
-        let bound = L::splat(token, size * far * (8.0 * ROUNDING) + thick);
+        let bound = L::splat(token, sizes.element_sum() * far * (8.0 * ROUNDING) + thick);
         let n = vec3x::splat::<L>(token, normal.to_array());
         let plane = vec3x::dot(n, a);
-        let mut low = L::splat(token, 0.0);
-        let mut high = low;
+        // Seen from x, it is x itself that is not rounded: triangles of the surface that x lies on do not come between.
+        let [x, y, z] = vec3x::splat::<L>(token, (sizes * (8.0 * ROUNDING)).to_array());
+        let mut high = x.mul_add(a[0].abs(), y.mul_add(a[1].abs(), z * a[2].abs()));
+        let mut low = -high;
         let mut k = 0;
         while k < 4 {
             let [x, y, z] = self.corners[k];
             let at = n[0].mul_add(x, n[1].mul_add(y, n[2] * z));
-            (low, high) = (low.min(at), high.max(at));
+            (low, high) = (low.min(at - bound), high.max(at + bound));
             k += 1;
         }
-        (low - bound).le(plane) & plane.le(high + bound)
+        low.le(plane) & plane.le(high)
     }
 }
 

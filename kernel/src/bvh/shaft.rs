@@ -228,7 +228,8 @@ pub(super) struct Shaft {
     upper: Vec3,
     /// Eight around the points and eight around the targets; `k` and `k ^ 4` are where a flat box is thin.
     pub(super) corners: [[f32; 16]; 3],
-    /// The greatest component of a corner around the points, and around the targets, or a little more.
+    /// How far the corners around the points, and around the targets, are along each axis, or a little more; and along any.
+    reach: [Vec3; 2],
     pub(super) farthest: [f32; 2],
 }
 
@@ -359,6 +360,7 @@ impl Shaft {
             lower,
             upper,
             corners,
+            reach: [near, far],
             farthest,
         })
     }
@@ -444,19 +446,29 @@ impl Shaft {
         let (e, f) = (vec3x::sub(b, a), vec3x::sub(c, a));
         let (e_size, f_size) = (vec3x::abs(e), vec3x::abs(f));
         let n = vec3x::cross(e, f);
-        let n_size = (e_size[1] * f_size[2] + e_size[2] * f_size[1])
-            + (e_size[2] * f_size[0] + e_size[0] * f_size[2])
-            + (e_size[0] * f_size[1] + e_size[1] * f_size[0]);
-        let far = vec3x::most(vec3x::abs(a)).max(vec3x::most(vec3x::abs(b))).max(vec3x::most(vec3x::abs(c)));
+        let rounding = S::Node::splat(token, 8.0 * ROUNDING);
+        let n_size = [
+            (e_size[1] * f_size[2] + e_size[2] * f_size[1]) * rounding,
+            (e_size[2] * f_size[0] + e_size[0] * f_size[2]) * rounding,
+            (e_size[0] * f_size[1] + e_size[1] * f_size[0]) * rounding,
+        ];
+        let (a_size, b_size, c_size) = (vec3x::abs(a), vec3x::abs(b), vec3x::abs(c));
+        let far = [
+            a_size[0].max(b_size[0]).max(c_size[0]),
+            a_size[1].max(b_size[1]).max(c_size[1]),
+            a_size[2].max(b_size[2]).max(c_size[2]),
+        ];
         let plane = vec3x::dot(n, a);
         // The corners around the points are close to the reference, and so hardly rounded; those around the targets
-        // are not. The surface that the points lie on is told from things in between by the clearance alone.
-        let rounding = n_size * S::Node::splat(token, 8.0 * ROUNDING);
+        // are not. The surface that the points lie on is told from things in between by the clearance alone, and what is
+        // far along it matters the less the straighter it lies along the axes.
         let mut low = S::Node::splat(token, f32::INFINITY);
         let mut high = S::Node::splat(token, f32::NEG_INFINITY);
         let mut side = 0;
         while side < 2 {
-            let bound = rounding * (far + S::Node::splat(token, 2.0 * self.farthest[side]));
+            let [x, y, z] = vec3x::splat::<S::Node>(token, (self.reach[side] * 2.0).to_array());
+            let bound =
+                n_size[0].mul_add(far[0] + x, n_size[1].mul_add(far[1] + y, n_size[2] * (far[2] + z)));
             let mut k = 8 * side;
             while k < 8 * side + 8 {
                 let [x, y, z] = vec3x::broadcast::<S::Node, 16>(token, &self.corners, k);
