@@ -104,6 +104,8 @@ pub(super) struct Abreast {
     s: [[f32; MOST]; ABREAST],
     t: [[f32; MOST]; ABREAST],
     placed: u32,
+    /// How many times a triangle was held against a point's targets, until it is set back.
+    pub(super) pairs: u32,
     forms: Forms,
     /// Targets of each point that are blocked.
     pub(super) blocked: [u64; ABREAST],
@@ -114,6 +116,7 @@ impl Abreast {
         s: [[0.0; MOST]; ABREAST],
         t: [[0.0; MOST]; ABREAST],
         placed: 0,
+        pairs: 0,
         forms: Forms::NOTHING,
         blocked: [0; ABREAST],
     };
@@ -239,6 +242,7 @@ impl<S: Simd> Bvh<'_, S> {
         if left == 0 {
             return;
         }
+        abreast.pairs += left.count_ones();
         let before = known & outline.before.bits();
         let all = before & outline.every.bits();
         outline.store(&mut abreast.forms, 0);

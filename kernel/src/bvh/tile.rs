@@ -46,6 +46,8 @@ pub struct TileScratch {
     inner: List,
     /// Where the last sheet that hid a whole light was grown from.
     sheet: Option<Place>,
+    /// For how many tiles to come long lists are not asked.
+    thick: u32,
 }
 
 impl TileScratch {
@@ -61,6 +63,7 @@ impl TileScratch {
             inner_cut: Cut::NOTHING,
             inner: List::EMPTY,
             sheet: None,
+            thick: 0,
         }
     }
 }
@@ -84,6 +87,8 @@ struct Cut {
     count: usize,
     /// Yet to look into, while the shaft goes down.
     queue: [Entry; QUEUE],
+    /// How far the queue had come when it was last short enough for a cut, and the list empty.
+    saved: (usize, usize),
 }
 
 /// A subtree and its box.
@@ -120,12 +125,40 @@ impl Cut {
         nodes: [Node::EMPTY; CUT / Node::WIDTH],
         count: 0,
         queue: [Entry { child: Child::NONE, bounds: [[0.0; 3]; 2], path: Path::TOP }; QUEUE],
+        saved: (0, 0),
     };
 
     /// The nodes in use.
     #[inline(always)]
     fn nodes(&self) -> &[Node] {
         &self.nodes[..self.count.div_ceil(Node::WIDTH)]
+    }
+
+    /// Keeps the subtrees that were saved, in the tree's order: it puts first what is likeliest to block for the work
+    /// that it takes.
+    #[inline(always)]
+    fn keep(&mut self) {
+        let (head, len) = self.saved;
+        let mut order = ArrayVec::<(u64, usize), CUT>::new();
+        let mut k = head;
+        while k < len {
+            let places = self.queue[k].path.places;
+            let mut slot = order.len();
+            order.push((places, k));
+            while slot > 0 && order[slot - 1].0 > places {
+                order[slot] = order[slot - 1];
+                slot -= 1;
+            }
+            order[slot] = (places, k);
+            k += 1;
+        }
+        self.count = 0;
+        let mut k = 0;
+        while k < order.len() {
+            let entry = self.queue[order[k].1];
+            self.push(&entry);
+            k += 1;
+        }
     }
 
     /// Adds a subtree. There must be room.
@@ -270,15 +303,19 @@ const SHARED: usize = 32;
 const WORTHWHILE: usize = 32;
 
 /// Tiles with as many samples a point and more points than a part has are asked about part by part, unless the list is
-/// short.
-const PARTED: usize = 8;
+/// short. Where there is more in the way than fits a list, so many parts must gain something for the others to be tried.
+const FINE: usize = 32;
 const PART: usize = 16;
 const SHORT: usize = 12;
-
-/// With as many samples a point, also where there is more in the way than fits a list; so many parts must gain something
-/// for the others to be tried.
-const FINE: usize = 32;
 const TRIED: usize = 2;
+
+/// With fewer samples a point, a list that is longer is asked for some points, and for the others only if no more of its
+/// triangles than this come before the targets of a point: else going down the tree is quicker.
+const LONG: usize = 16;
+const PAIRS: usize = 6;
+
+/// So many tiles after one where it is, long lists are not asked at all.
+const AGAIN: u32 = 3;
 
 /// What points are asked with.
 struct Work<'w> {
@@ -360,7 +397,8 @@ impl<S: Simd> Bvh<'_, S> {
             fill_all(blocked, points);
             return;
         }
-        let TileScratch { batch, cut, given, learned, packet, abreast, inner_cut, inner, sheet } = scratch;
+        let TileScratch { batch, cut, given, learned, packet, abreast, inner_cut, inner, sheet, thick } =
+            scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
             Some(shaft) => self.gather(shaft, &self.nodes[..1], rays, points.len(), cut, given, counter),
@@ -382,12 +420,31 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls };
-        let least = if complete { PARTED } else { FINE };
-        let apart =
-            rays >= least * points.len() && points.len() > PART && !(complete && given.count <= SHORT);
+        let fine = rays >= FINE * points.len();
+        let apart = fine && points.len() > PART && !(complete && given.count <= SHORT);
         let Some(whole) = shaft.as_ref().filter(|_| apart) else {
             let shaft = shaft.as_ref();
-            self.ask_points(shaft, complete, points, targets, cut, given, ignore, counter, work, blocked);
+            let mut rest = points;
+            let mut complete = complete;
+            if complete && given.count > LONG && !fine && points.len() > S::Packet::WIDTH {
+                let mut many = *thick > 0;
+                *thick = thick.saturating_sub(1);
+                if !many {
+                    let some = &points[..S::Packet::WIDTH];
+                    rest = &points[S::Packet::WIDTH..];
+                    work.abreast.pairs = 0;
+                    self.ask_points(shaft, true, some, targets, cut, given, ignore, counter, work, blocked);
+                    many = work.abreast.pairs as usize > PAIRS * some.len();
+                    if many {
+                        *thick = AGAIN;
+                    }
+                }
+                if many {
+                    (complete, given.count) = (false, 0);
+                    cut.keep();
+                }
+            }
+            self.ask_points(shaft, complete, rest, targets, cut, given, ignore, counter, work, blocked);
             return;
         };
         // Neighbours among the neighbours have narrower shafts.
@@ -947,14 +1004,13 @@ impl<S: Simd> Bvh<'_, S> {
             self.enqueue(shaft, &roots[done], cut, &mut len, Path::TOP.below(done), counter);
             done += 1;
         }
-        // How far the queue had come when it was last short enough for a cut, and the list empty.
-        let mut saved = (0, len);
+        cut.saved = (0, len);
         loop {
             if head == len {
                 return true;
             }
             if len - head <= CUT && list.count == 0 {
-                saved = (head, len);
+                cut.saved = (head, len);
             }
             if done > steps {
                 break;
@@ -972,28 +1028,8 @@ impl<S: Simd> Bvh<'_, S> {
             }
         }
         // A list that is not all there is would be asked for nothing as often as not.
-        let (head, len) = saved;
         list.count = 0;
-        // In the tree's order, which puts first what is likeliest to block for the work that it takes.
-        let mut order = ArrayVec::<(u64, usize), CUT>::new();
-        let mut k = head;
-        while k < len {
-            let places = cut.queue[k].path.places;
-            let mut slot = order.len();
-            order.push((places, k));
-            while slot > 0 && order[slot - 1].0 > places {
-                order[slot] = order[slot - 1];
-                slot -= 1;
-            }
-            order[slot] = (places, k);
-            k += 1;
-        }
-        let mut k = 0;
-        while k < order.len() {
-            let entry = cut.queue[order[k].1];
-            cut.push(&entry);
-            k += 1;
-        }
+        cut.keep();
         false
     }
 }
