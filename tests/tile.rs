@@ -182,6 +182,71 @@ fn tiles_answer_as_single_rays_do() {
     }
 }
 
+/// Walls along the axes that a light touches, which is turned to them: their planes are told from its corners by the last
+/// bits of either.
+#[test]
+fn walls_at_the_corner_of_a_light() {
+    let mut random = Random::new(23);
+    let mut scratch = TileScratch::new();
+    let mut total = [0, 0];
+    for _ in 0..3000 {
+        let axis = random.below(3);
+        let world = |v: Vec3| match axis {
+            0 => v,
+            1 => Vec3::new(v.z, v.x, v.y),
+            _ => Vec3::new(v.y, v.z, v.x),
+        };
+        let size = random.any_scale(-4.0, -1.0);
+        let away =
+            Vec3::new(random.between(-1e-3, 1e-3), random.between(-1.0, 1.0), random.between(5.0, 20.0));
+        let half = std::f32::consts::FRAC_1_SQRT_2 * size;
+        let (u, v) = (Vec3::new(half, 0.0, half), Vec3::new(0.0, size, 0.0));
+        let mut ends = Vec::new();
+        let count = 1 + random.below(4);
+        let xs: Vec<Vec3> = (0..count).map(|_| random.point() * Vec3::new(1.0, 0.1, 0.1) - Vec3::X).collect();
+        let mut points = Vec::new();
+        for (k, x) in xs.iter().enumerate() {
+            // The first where all of it is counted from, so that nothing moves the light.
+            let x = if k == 0 { Vec3::ZERO } else { *x };
+            points.push(TilePoint { x: world(x).to_array(), first: ends.len() as u32, count: 32 });
+            ends.extend((0..32).map(|_| {
+                let [s, t] = [0, 1].map(|_| if random.below(3) == 0 { 1.0 } else { random.unit() });
+                away + u * (2.0 * s - 1.0) + v * (2.0 * t - 1.0)
+            }));
+        }
+        // Some last bits beside the light's greatest x.
+        let last = ends.iter().map(|end| end.x).fold(f32::MIN, f32::max);
+        let wall = last - random.between(-3.0, 3.0) * f32::EPSILON * 20.0 * random.any_scale(-3.0, 0.0);
+        let [p, q, r, s] = [[-50.0, -1.0], [50.0, -1.0], [50.0, 50.0], [-50.0, 50.0]]
+            .map(|[y, z]| world(Vec3::new(wall, y, z)));
+        let accel = Accel::from_triangles(&[[p, q, r], [p, r, s]], Quality::Medium);
+        let ends: Vec<Vec3> = ends.into_iter().map(world).collect();
+        let [x, y, z] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let any = Targets::new(&x, &y, &z).expect("of one length");
+        let flat = any.on_parallelogram(world(away - u - v), world(u * 2.0), world(v * 2.0));
+        for on in families(accel.bvh()) {
+            for targets in [any, flat] {
+                let mut blocked = vec![0; ends.len().div_ceil(64)];
+                on.occluded_tile(&points, &targets, None, &mut Counts::default(), &mut scratch, &mut blocked);
+                for point in &points {
+                    for i in point.first as usize..(point.first + point.count) as usize {
+                        let ray = Ray::segment(point.x, ends[i]);
+                        let want = on.occluded(&ray, None, &mut Counts::default());
+                        assert_eq!(
+                            blocked[i / 64] >> (i % 64) & 1 != 0,
+                            want,
+                            "{}: {ray:?}, {wall}",
+                            on.family
+                        );
+                        total[usize::from(want)] += 1;
+                    }
+                }
+            }
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
+}
+
 #[test]
 fn a_target_that_is_no_number_is_free() {
     // A sheet hides all of the light, but nothing hides what is nowhere.

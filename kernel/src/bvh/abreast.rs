@@ -231,7 +231,7 @@ impl<S: Simd> Bvh<'_, S> {
         if met.bits() & *open == 0 {
             return;
         }
-        let met = met & views.crosses(token, flat, block, lane, from_x[0]);
+        let met = met & views.crosses(token, flat, block, lane, from_x);
         let met = met.bits() & *open;
         if met == 0 {
             return;
@@ -414,7 +414,7 @@ impl<L: Lanes> Views<L> {
         ]
     }
 
-    /// Points that have some target on the other side of the triangle's plane. `a` is its first vertex from x.
+    /// Points that have some target on the other side of the triangle's plane. `from_x` are its vertices from x.
     #[inline(always)]
     fn crosses(
         &self,
@@ -422,7 +422,7 @@ impl<L: Lanes> Views<L> {
         flat: &Flat,
         block: &TriangleBlock,
         lane: usize,
-        a: Vec3x<L>,
+        from_x: [Vec3x<L>; 3],
     ) -> L::Mask {
         let [p, q, r] = block.get(lane);
         let (p, q, r) = (Vec3::from(p), Vec3::from(q), Vec3::from(r));
@@ -435,10 +435,11 @@ impl<L: Lanes> Views<L> {
         let thick = 0.5 * (flat.greatest[2] - flat.least[2]) * normal.dot(flat.normal).abs();
         let bound = L::splat(token, sizes.element_sum() * far * (8.0 * ROUNDING) + thick);
         let n = vec3x::splat::<L>(token, normal.to_array());
-        let plane = vec3x::dot(n, a);
+        let plane = vec3x::dot(n, from_x[0]);
         // Seen from x, it is x itself that is not rounded: triangles of the surface that x lies on do not come between.
         let [x, y, z] = vec3x::splat::<L>(token, (sizes * (8.0 * ROUNDING)).to_array());
-        let mut high = x.mul_add(a[0].abs(), y.mul_add(a[1].abs(), z * a[2].abs()));
+        let far = [farthest(from_x, 0), farthest(from_x, 1), farthest(from_x, 2)];
+        let mut high = x.mul_add(far[0], y.mul_add(far[1], z * far[2]));
         let mut low = -high;
         let mut k = 0;
         while k < 4 {
@@ -449,6 +450,12 @@ impl<L: Lanes> Views<L> {
         }
         low.le(plane) & plane.le(high)
     }
+}
+
+/// The greatest distance along an axis.
+#[inline(always)]
+fn farthest<L: Lanes>([a, b, c]: [Vec3x<L>; 3], axis: usize) -> L {
+    a[axis].abs().max(b[axis].abs()).max(c[axis].abs())
 }
 
 /// Where the targets of a point lie on the light.

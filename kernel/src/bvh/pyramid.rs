@@ -88,17 +88,17 @@ pub(super) struct Pyramid {
 
 /// Positions with `normal . position + offset >= 0` may be in the pyramid.
 #[derive(Clone, Copy, Default)]
-pub(super) struct Plane {
+struct Plane {
     normal: Vec3,
     offset: f32,
     /// Which corner of a box reaches farthest inside, by axis: 0 the least, 1 the greatest.
-    pub(super) side: [usize; 3],
+    side: [usize; 3],
 }
 
 impl Plane {
     /// With `normal . (p - x) + at >= 0` inside, and as much beyond as the slack says.
     #[inline(always)]
-    pub(super) fn new(normal: Vec3, at: f32, x: Vec3, slack: f32) -> Self {
+    fn new(normal: Vec3, at: f32, x: Vec3, slack: f32) -> Self {
         Self {
             normal,
             offset: at - normal.dot(x) + slack,
@@ -117,7 +117,7 @@ impl Plane {
 
     /// How far inside positions are.
     #[inline(always)]
-    pub(super) fn at<L: Lanes>(&self, token: L::Token, [x, y, z]: [L; 3]) -> L {
+    fn at<L: Lanes>(&self, token: L::Token, [x, y, z]: [L; 3]) -> L {
         x.mul_add(
             L::splat(token, self.normal.x),
             y.mul_add(

@@ -107,11 +107,11 @@ impl<L: Lanes> Boxes<L> {
     fn either(token: L::Token, boxes: [&Turned; 2], weights: [L; 2]) -> Self {
         let [a, b] = boxes;
         Self {
-            middle: either(token, [a.middle, b.middle], weights),
+            middle: weighted(token, [a.middle, b.middle], weights),
             axes: [
-                either(token, [a.axes[0], b.axes[0]], weights),
-                either(token, [a.axes[1], b.axes[1]], weights),
-                either(token, [a.axes[2], b.axes[2]], weights),
+                weighted(token, [a.axes[0], b.axes[0]], weights),
+                weighted(token, [a.axes[1], b.axes[1]], weights),
+                weighted(token, [a.axes[2], b.axes[2]], weights),
             ],
         }
     }
@@ -137,7 +137,7 @@ impl<L: Lanes> Boxes<L> {
 
 /// Sums of vectors, weighted lane by lane.
 #[inline(always)]
-fn either<L: Lanes, const N: usize>(token: L::Token, vectors: [Vec3; N], weights: [L; N]) -> Vec3x<L> {
+fn weighted<L: Lanes, const N: usize>(token: L::Token, vectors: [Vec3; N], weights: [L; N]) -> Vec3x<L> {
     let mut sum = vec3x::splat(token, [0.0; 3]);
     let mut k = 0;
     while k < N {
@@ -228,8 +228,7 @@ pub(super) struct Shaft {
     upper: Vec3,
     /// Eight around the points and eight around the targets; `k` and `k ^ 4` are where a flat box is thin.
     pub(super) corners: [[f32; 16]; 3],
-    /// How far the corners around the points, and around the targets, are along each axis, or a little more; and along any.
-    reach: [Vec3; 2],
+    /// The greatest component of a corner around the points, and around the targets, or a little more.
     pub(super) farthest: [f32; 2],
 }
 
@@ -291,7 +290,7 @@ impl Shaft {
             while side < 2 {
                 let turned = if side == 0 { points } else { targets };
                 let [x, y, z] = vec3x::splat::<S::Node>(token, turned.middle.to_array());
-                let [a, b, c] = either(token, turned.axes, signs);
+                let [a, b, c] = weighted(token, turned.axes, signs);
                 (x + a).store(&mut corners[0][8 * side + from..]);
                 (y + b).store(&mut corners[1][8 * side + from..]);
                 (z + c).store(&mut corners[2][8 * side + from..]);
@@ -300,10 +299,10 @@ impl Shaft {
             // Facets through an edge of one box and the corner of the other that lies farthest out. The boxes are flat
             // as a rule, so two of the axes matter.
             let axes = [targets.axes[0], targets.axes[1], points.axes[0], points.axes[1]];
-            let edge = either(token, axes, weights::<S::Node, 4>(token, &EDGE, from));
-            let side = either(token, axes, weights::<S::Node, 4>(token, &SIDE, from));
+            let edge = weighted(token, axes, weights::<S::Node, 4>(token, &EDGE, from));
+            let side = weighted(token, axes, weights::<S::Node, 4>(token, &SIDE, from));
             let of = weights::<S::Node, 2>(token, &OF, from);
-            let [x, y, z] = either(token, [targets.middle, points.middle], of);
+            let [x, y, z] = weighted(token, [targets.middle, points.middle], of);
             let at = [x + side[0], y + side[1], z + side[2]];
             let other = Boxes::either(token, [points, targets], of);
             let normal = vec3x::cross(edge, vec3x::sub(at, other.middle));
@@ -360,7 +359,6 @@ impl Shaft {
             lower,
             upper,
             corners,
-            reach: [near, far],
             farthest,
         })
     }
@@ -446,29 +444,23 @@ impl Shaft {
         let (e, f) = (vec3x::sub(b, a), vec3x::sub(c, a));
         let (e_size, f_size) = (vec3x::abs(e), vec3x::abs(f));
         let n = vec3x::cross(e, f);
-        let rounding = S::Node::splat(token, 8.0 * ROUNDING);
-        let n_size = [
-            (e_size[1] * f_size[2] + e_size[2] * f_size[1]) * rounding,
-            (e_size[2] * f_size[0] + e_size[0] * f_size[2]) * rounding,
-            (e_size[0] * f_size[1] + e_size[1] * f_size[0]) * rounding,
-        ];
-        let (a_size, b_size, c_size) = (vec3x::abs(a), vec3x::abs(b), vec3x::abs(c));
-        let far = [
-            a_size[0].max(b_size[0]).max(c_size[0]),
-            a_size[1].max(b_size[1]).max(c_size[1]),
-            a_size[2].max(b_size[2]).max(c_size[2]),
-        ];
+        let n_size = (e_size[1] * f_size[2] + e_size[2] * f_size[1])
+            + (e_size[2] * f_size[0] + e_size[0] * f_size[2])
+            + (e_size[0] * f_size[1] + e_size[1] * f_size[0]);
+        let far = vec3x::most(vec3x::abs(a)).max(vec3x::most(vec3x::abs(b))).max(vec3x::most(vec3x::abs(c)));
         let plane = vec3x::dot(n, a);
         // The corners around the points are close to the reference, and so hardly rounded; those around the targets
-        // are not. The surface that the points lie on is told from things in between by the clearance alone, and what is
-        // far along it matters the less the straighter it lies along the axes.
+        // are not, and where a segment ends is rounded as far as it is long. The surface that the points lie on is told
+        // from things in between by the clearance alone. Axis by axis the bound would be too small: corners are sums along
+        // turned axes, whose rounding does not cancel where they do.
+        let rounding = n_size * S::Node::splat(token, 8.0 * ROUNDING);
+        let [near, away] = self.farthest;
+        let reach = [near, near + away];
         let mut low = S::Node::splat(token, f32::INFINITY);
         let mut high = S::Node::splat(token, f32::NEG_INFINITY);
         let mut side = 0;
         while side < 2 {
-            let [x, y, z] = vec3x::splat::<S::Node>(token, (self.reach[side] * 2.0).to_array());
-            let bound =
-                n_size[0].mul_add(far[0] + x, n_size[1].mul_add(far[1] + y, n_size[2] * (far[2] + z)));
+            let bound = rounding * (far + S::Node::splat(token, 2.0 * reach[side]));
             let mut k = 8 * side;
             while k < 8 * side + 8 {
                 let [x, y, z] = vec3x::broadcast::<S::Node, 16>(token, &self.corners, k);

@@ -46,7 +46,7 @@ pub struct TileScratch {
     inner: List,
     /// Where the last sheet that hid a whole light was grown from.
     sheet: Option<Place>,
-    /// For how many tiles to come long lists are not asked.
+    /// For how many tiles with long lists to come these are not asked.
     thick: u32,
 }
 
@@ -314,7 +314,7 @@ const TRIED: usize = 2;
 const LONG: usize = 16;
 const PAIRS: usize = 6;
 
-/// So many tiles after one where it is, long lists are not asked at all.
+/// Of so many tiles with such lists after one where it is, they are not asked at all.
 const AGAIN: u32 = 3;
 
 /// What points are asked with.
@@ -411,7 +411,7 @@ impl<S: Simd> Bvh<'_, S> {
             counter.rays(rays as u32);
             return;
         }
-        packet.count = 0;
+        (packet.count, abreast.pairs) = (0, 0);
         if let Some(shaft) = &shaft
             && self.sheet_between(shaft, if complete { Some(given) } else { None }, sheet, ignore, counter)
         {
@@ -432,7 +432,6 @@ impl<S: Simd> Bvh<'_, S> {
                 if !many {
                     let some = &points[..S::Packet::WIDTH];
                     rest = &points[S::Packet::WIDTH..];
-                    work.abreast.pairs = 0;
                     self.ask_points(shaft, true, some, targets, cut, given, ignore, counter, work, blocked);
                     many = work.abreast.pairs as usize > PAIRS * some.len();
                     if many {
@@ -1111,7 +1110,7 @@ pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
 
 /// Points from the `from`th on, one a lane; the last of all once more in the lanes beyond it.
 #[inline(always)]
-pub(super) fn points_from<L: Lanes>(token: L::Token, points: &[TilePoint], from: usize) -> Vec3x<L> {
+fn points_from<L: Lanes>(token: L::Token, points: &[TilePoint], from: usize) -> Vec3x<L> {
     let points = &points[from..];
     let mut lanes = [[0.0; 16]; 3];
     let mut lane = 0;
