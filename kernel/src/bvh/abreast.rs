@@ -438,8 +438,8 @@ impl<L: Lanes> Views<L> {
         let plane = vec3x::dot(n, from_x[0]);
         // Seen from x, it is x itself that is not rounded: triangles of the surface that x lies on do not come between.
         let [x, y, z] = vec3x::splat::<L>(token, (sizes * (8.0 * ROUNDING)).to_array());
-        let far = [farthest(from_x, 0), farthest(from_x, 1), farthest(from_x, 2)];
-        let mut high = x.mul_add(far[0], y.mul_add(far[1], z * far[2]));
+        let away = [farthest(from_x, 0), farthest(from_x, 1), farthest(from_x, 2)];
+        let mut high = x.mul_add(away[0], y.mul_add(away[1], z * away[2]));
         let mut low = -high;
         let mut k = 0;
         while k < 4 {

@@ -2,8 +2,9 @@
 //!
 //! A shaft around the points and the targets goes down the tree first. Often it comes back empty, and every target
 //! is visible; or a sheet of triangles stands across it ([`super::cover`]), and none is. Else it yields the few triangles
-//! there are, side by side in blocks of their own, or, where they are many, the subtrees to begin with. Long lists and
-//! subtrees are cut down by narrower shafts for parts of the points. Then the points are asked: abreast against a list
+//! there are, side by side in blocks of their own, or, where they are many, the subtrees to begin with. With many samples
+//! a point, long lists and subtrees are cut down by narrower shafts for parts of the points; with few, long lists of which
+//! most matter make room for the subtrees. Then the points are asked: abreast against a list
 //! ([`super::abreast`]), or from the subtrees on, up to 64 rays together ([`super::stream`]), where the triangles that
 //! blocked anything for one point are asked first for the next.
 
