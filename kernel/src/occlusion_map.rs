@@ -29,6 +29,7 @@
 use bytemuck::{Pod, Zeroable};
 use core::fmt;
 use glam::Vec3;
+use wide::{f32x8, i32x8};
 
 /// Bins along each edge of a light.
 pub const BIN_EDGE: usize = 8;
@@ -205,19 +206,15 @@ const PARTS: usize = 64;
 const LEAST_PARTS: usize = 2;
 const _: () = assert!(PARTS * PARTS / (BINS * LEAST_PARTS) == LEAST_CHANCE as usize);
 
-/// Shares the parts in proportion to the weights, with at least `least` for each; all alike where there are none.
-fn share(weights: &[f32; BIN_EDGE], least: usize) -> [u8; BIN_EDGE] {
-    let mut total = 0.0;
-    for &weight in weights {
-        total += weight;
-    }
-    let rest = (PARTS - least * BIN_EDGE) as f32;
+/// Shares the parts among columns in proportion to their weights, which are above 0.
+fn share(weights: &[f32; BIN_EDGE]) -> [u8; BIN_EDGE] {
+    let rest = (PARTS - LEAST_PARTS * BIN_EDGE) as f32;
+    let each = rest / weights.iter().sum::<f32>();
     let mut ends = [0; BIN_EDGE];
     let mut sum = 0.0;
     for (i, end) in ends.iter_mut().enumerate() {
         sum += weights[i];
-        let part = if total > 0.0 { sum / total } else { (i + 1) as f32 / BIN_EDGE as f32 };
-        *end = (least * (i + 1)) as u8 + (rest * part.min(1.0) + 0.5) as u8;
+        *end = (LEAST_PARTS * (i + 1)) as u8 + ((sum * each).min(rest) + 0.5) as u8;
     }
     ends[BIN_EDGE - 1] = PARTS as u8;
     ends
@@ -417,37 +414,38 @@ impl MapCell {
     /// What was seen in the bins around a bin counts as one ray more, and what was seen in the whole cell as a quarter
     /// of one among these: a bin amid dark ones is thought to be dark.
     pub fn expect(tallies: &[Tally; BINS]) -> Option<[f32; BINS]> {
-        let (mut asked, mut free) = (0.0, 0.0);
-        for tally in tallies {
-            asked += tally.asked as f32;
-            free += tally.free as f32;
+        // Asked and free, with a bin of nothing at both ends of each row, and a row of nothing at both ends.
+        const ROW: usize = BIN_EDGE + 2;
+        let mut seen = [[[0.0; ROW]; ROW]; 2];
+        for (row, tallies) in tallies.chunks_exact(BIN_EDGE).enumerate() {
+            for (column, tally) in tallies.iter().enumerate() {
+                seen[0][row + 1][column + 1] = tally.asked as f32;
+                seen[1][row + 1][column + 1] = tally.free as f32;
+            }
         }
+        let mut sums = [[0.0; ROW]; 2];
+        for (sums, rows) in sums.iter_mut().zip(&seen) {
+            rows.iter().for_each(|row| (0..ROW).for_each(|column| sums[column] += row[column]));
+        }
+        let [asked, free] = [sums[0].iter().sum::<f32>(), sums[1].iter().sum()];
         if asked < ENOUGH {
             return None;
         }
         let whole = (free + 0.5 * DOUBT) / (asked + DOUBT);
         let mut expected = [0.0; BINS];
-        // Sums of threes along the rows, and then of these along the columns.
-        let mut rows = [[0.0; 2]; BINS];
-        for (bin, row) in rows.iter_mut().enumerate() {
-            let column = bin % BIN_EDGE;
-            let mut at = bin - usize::from(column > 0);
-            while at <= bin + usize::from(column + 1 < BIN_EDGE) {
-                row[0] += tallies[at].asked as f32;
-                row[1] += tallies[at].free as f32;
-                at += 1;
+        for (row, expected) in expected.chunks_exact_mut(BIN_EDGE).enumerate() {
+            // Sums of threes down the columns, and then of these along the rows.
+            let mut down = [[0.0; ROW]; 2];
+            for (down, seen) in down.iter_mut().zip(&seen) {
+                for (i, sum) in down.iter_mut().enumerate() {
+                    *sum = seen[row][i] + seen[row + 1][i] + seen[row + 2][i];
+                }
             }
-        }
-        for (bin, p) in expected.iter_mut().enumerate() {
-            let (mut near, mut near_free) = (DOUBT, DOUBT * whole);
-            let mut at = if bin >= BIN_EDGE { bin - BIN_EDGE } else { bin };
-            while at <= bin + BIN_EDGE && at < BINS {
-                near += rows[at][0];
-                near_free += rows[at][1];
-                at += BIN_EDGE;
+            for (i, p) in expected.iter_mut().enumerate() {
+                let near = down[0][i] + down[0][i + 1] + down[0][i + 2] + DOUBT;
+                let near_free = down[1][i] + down[1][i + 1] + down[1][i + 2] + DOUBT * whole;
+                *p = (seen[1][row + 1][i + 1] + near_free / near) / (seen[0][row + 1][i + 1] + 1.0);
             }
-            let own = tallies[bin];
-            *p = (own.free as f32 + near_free / near) / (own.asked as f32 + 1.0);
         }
         Some(expected)
     }
@@ -469,52 +467,71 @@ impl MapCell {
     }
 
     fn set_odds(&mut self, expected: &[f32; BINS], rates: &Rates) {
-        let mut mean = 0.0;
-        for (bin, &p) in expected.iter().enumerate() {
-            self.u[bin] = if p < 0.5 { 0 } else { (p * 255.0 + 0.5) as u8 };
-            self.class[bin] = class(p) as u8;
-            mean += f32::from(self.u[bin]);
+        self.class = classes(expected);
+        for (u, &p) in self.u.iter_mut().zip(expected) {
+            *u = if p < 0.5 { 0 } else { (p * 255.0 + 0.5) as i32 as u8 };
         }
-        self.mean = mean / BINS as f32;
-        let alike =
-            self.u.iter().all(|&u| u == self.u[0]) && self.class.iter().all(|&class| class == self.class[0]);
+        self.mean = self.u.iter().map(|&u| u32::from(u)).sum::<u32>() as f32 / BINS as f32;
+        let alike = self.u == [self.u[0]; BINS] && self.class == [self.class[0]; BINS];
         self.flat = u32::from(alike);
-        let plan = rates.plan(expected);
+        let plan = rates.plan(&self.class);
         let level = if plan.unsure(rates, rates.best) { plan.level } else { rates.best };
         let part = plan.mean(rates, level);
-        let rate = |class: u8| rates.of[level][usize::from(class) & (CLASSES - 1)];
-        let mut columns = [0.0; BIN_EDGE];
-        for (bin, &class) in self.class.iter().enumerate() {
-            columns[bin % BIN_EDGE] += rate(class);
+        if alike {
+            let variance = rates.variance[usize::from(self.class[0]) & (CLASSES - 1)];
+            (self.columns, self.rows) = (EVEN, [EVEN; BIN_EDGE]);
+            self.part = part.clamp(1.0 / LEAST_CHANCE as f32, 1.0);
+            self.error = variance * left(self.part, rates.spread);
+            self.usual = variance * rates.spread;
+            return;
         }
-        self.columns = share(&columns, LEAST_PARTS);
-        let mut densities = [0.0; BINS];
-        let mut least = f32::INFINITY;
+        // Row by row.
+        let (mut wanted, mut variances) = ([[0.0; BIN_EDGE]; BIN_EDGE], [[0.0; BIN_EDGE]; BIN_EDGE]);
+        for (row, classes) in self.class.chunks_exact(BIN_EDGE).enumerate() {
+            for (column, &class) in classes.iter().enumerate() {
+                let class = usize::from(class) & (CLASSES - 1);
+                wanted[row][column] = rates.of[level][class];
+                variances[row][column] = rates.variance[class];
+            }
+        }
+        let (wanted, variances) = (wanted.map(f32x8::new), variances.map(f32x8::new));
+        let columns = wanted.iter().fold(f32x8::ZERO, |sum, &row| sum + row);
+        self.columns = share(columns.as_array());
+        let mut widths = [0.0; BIN_EDGE];
         let mut from = 0;
-        for column in 0..BIN_EDGE {
-            let mut rows = [0.0; BIN_EDGE];
-            for (row, weight) in rows.iter_mut().enumerate() {
-                *weight = rate(self.class[row * BIN_EDGE + column]);
-            }
-            self.rows[column] = share(&rows, 1);
-            let mut above = 0;
-            for row in 0..BIN_EDGE {
-                let parts =
-                    f32::from(self.columns[column] - from) * f32::from(self.rows[column][row] - above);
-                let density = parts * (BINS as f32 / (PARTS * PARTS) as f32);
-                densities[row * BIN_EDGE + column] = density;
-                least = density.min(least);
-                above = self.rows[column][row];
-            }
-            from = self.columns[column];
+        for (width, to) in widths.iter_mut().zip(self.columns) {
+            *width = f32::from(to - from) * (BINS as f32 / (PARTS * PARTS) as f32);
+            from = to;
         }
+        // The same for the rows of each column, with one part at least for each; all columns side by side.
+        let rest = f32x8::splat((PARTS - BIN_EDGE) as f32);
+        let each = rest / columns;
+        let (mut sum, mut above) = (f32x8::ZERO, f32x8::ZERO);
+        let mut densities = [f32x8::ZERO; BIN_EDGE];
+        for (row, &wanted) in wanted.iter().enumerate() {
+            sum += wanted;
+            let parts = ((sum * each).fast_min(rest) + 0.5).fast_trunc_int() + i32x8::splat(row as i32 + 1);
+            let parts = if row + 1 < BIN_EDGE { parts } else { i32x8::splat(PARTS as i32) };
+            for (rows, &end) in self.rows.iter_mut().zip(parts.as_array()) {
+                rows[row] = end as u8;
+            }
+            let end = parts.round_float();
+            densities[row] = f32x8::new(widths) * (end - above);
+            above = end;
+        }
+        let least = densities.iter().fold(densities[0], |least, &row| least.fast_min(row));
+        let least = least.to_array().into_iter().fold(f32::INFINITY, f32::min);
         self.part = part.clamp(1.0 / (LEAST_CHANCE as f32 * least), 1.0);
-        (self.error, self.usual) = (0.0, 0.0);
-        for (density, &class) in densities.iter().zip(&self.class) {
-            let variance = rates.variance[usize::from(class) & (CLASSES - 1)];
-            self.error += variance * left(density * self.part, rates.spread) / BINS as f32;
-            self.usual += variance * rates.spread / BINS as f32;
+        let (mut error, mut usual) = (f32x8::ZERO, f32x8::ZERO);
+        for (&density, &variances) in densities.iter().zip(&variances) {
+            // What `left` says.
+            let (rate, spread) = (density * self.part, f32x8::splat(rates.spread));
+            let [many, few] = [spread / (rate * rate.sqrt()), 1.0 / rate - 1.0 + spread];
+            error += variances * rate.simd_ge(1.0).select(many, few);
+            usual += variances;
         }
+        self.error = error.reduce_add() / BINS as f32;
+        self.usual = usual.reduce_add() * rates.spread / BINS as f32;
     }
 }
 
@@ -535,16 +552,19 @@ pub const LEVELS: usize = 32;
 pub struct Rates {
     /// For less and less doubt, so that there are more and more.
     of: [[f32; CLASSES]; LEVELS],
+    /// What these leave of the variance.
+    left: [[f32; CLASSES]; LEVELS],
     best: usize,
     variance: [f32; CLASSES],
     spread: f32,
 }
 
 impl Rates {
-    /// The same for all.
+    /// The same for all, above 0.
     pub fn each(rate: f32) -> Self {
-        let variance = [UNSURE as f32; CLASSES];
-        Self { of: [[rate; CLASSES]; LEVELS], best: 0, variance, spread: 1.0 }
+        let rate = rate.max(1.0 / (1 << 20) as f32);
+        let [of, left] = [rate, UNSURE as f32 * left(rate, 1.0)].map(|each| [[each; CLASSES]; LEVELS]);
+        Self { of, left, best: 0, variance: [UNSURE as f32; CLASSES], spread: 1.0 }
     }
 
     /// Of a class, where nothing limits them.
@@ -557,14 +577,16 @@ impl Rates {
         self.spread
     }
 
-    fn plan(&self, expected: &[f32; BINS]) -> Plan {
-        let mut plan = Plan { members: [0; CLASSES], level: LEVELS - 1, worst: CLASSES - 1 };
-        for &p in expected {
-            plan.members[class(p)] += 1;
-            plan.worst = plan.worst.min(class(p));
-        }
-        while plan.level > 0 && plan.mean(self, plan.level) > 1.0 {
-            plan.level -= 1;
+    fn plan(&self, classes: &[u8; BINS]) -> Plan {
+        let count = |class: usize| classes.iter().map(|&other| u8::from(other == class as u8)).sum();
+        let members: [u8; CLASSES] = core::array::from_fn(count);
+        let worst = members.iter().position(|&members| members > 0).unwrap_or(CLASSES - 1);
+        let mut plan = Plan { members, level: 0, worst };
+        // Rates grow from level to level.
+        let mut beyond = LEVELS;
+        while beyond - plan.level > 1 {
+            let middle = (plan.level + beyond) / 2;
+            if plan.mean(self, middle) > 1.0 { beyond = middle } else { plan.level = middle }
         }
         plan
     }
@@ -586,7 +608,7 @@ impl Rates {
                 for class in worst..CLASSES {
                     let (bins, rate) = (demand.bins[worst][class], self.of[level][class]);
                     work += SURE * bins * f64::from(rate);
-                    error += bins * f64::from(self.variance[class] * left(rate, self.spread));
+                    error += bins * f64::from(self.left[level][class]);
                 }
             }
             if work * error < least {
@@ -609,11 +631,11 @@ struct Plan {
 impl Plan {
     /// The part of the usual number of samples that it gets.
     fn mean(&self, rates: &Rates, level: usize) -> f32 {
-        let mut sum = 0.0;
-        for (&members, &rate) in self.members.iter().zip(&rates.of[level]) {
-            sum += f32::from(members) * rate;
+        let mut sums = [0.0; 4];
+        for (members, rates) in self.members.chunks_exact(4).zip(rates.of[level].chunks_exact(4)) {
+            (0..4).for_each(|i| sums[i] += f32::from(members[i]) * rates[i]);
         }
-        sum / BINS as f32
+        sums.iter().sum::<f32>() / BINS as f32
     }
 
     /// Is there a bin that is worth a usual sample? Then the cell gets as many as it may: a point that is asked at all
@@ -641,13 +663,12 @@ impl Default for Demand {
 impl Demand {
     /// Adds a cell of which one expects this, and which so many points ask.
     pub fn add(&mut self, expected: &[f32; BINS], points: f64, rates: &Rates) {
-        let plan = rates.plan(expected);
+        let plan = rates.plan(&classes(expected));
         self.points[plan.worst] += points;
         for (class, &members) in plan.members.iter().enumerate() {
             let part = points * f64::from(members) / BINS as f64;
             self.bins[plan.worst][class] += part;
-            let rate = rates.of[plan.level][class];
-            self.error[plan.worst] += part * f64::from(rates.variance[class] * left(rate, rates.spread));
+            self.error[plan.worst] += part * f64::from(rates.left[plan.level][class]);
         }
     }
 }
@@ -662,6 +683,15 @@ pub fn class(p: f32) -> usize {
     // Minus the logarithm to base 2, rounded down.
     let power = 126 - (variance.to_bits() >> 23) as i32;
     power.clamp(0, CLASSES as i32 - 1) as usize
+}
+
+/// The classes of all bins of a cell.
+fn classes(expected: &[f32; BINS]) -> [u8; BINS] {
+    let mut classes = [0; BINS];
+    for (of, &p) in classes.iter_mut().zip(expected) {
+        *of = class(p) as u8;
+    }
+    classes
 }
 
 /// What is thought of `(V - u)²` before there are rays to tell: enough to ask them.
@@ -720,15 +750,16 @@ impl Doubts {
         }
         rates.spread = spread;
         let mut price = 1.0;
-        for of in &mut rates.of {
-            for (rate, variance) in of.iter_mut().zip(rates.variance) {
+        for (of, kept) in rates.of.iter_mut().zip(&mut rates.left) {
+            for (class, variance) in rates.variance.into_iter().enumerate() {
                 let ratio = variance / price;
                 let wanted = if ratio < 1.0 {
                     libm::sqrtf(ratio)
                 } else {
                     libm::powf(1.5 * spread * ratio, 0.4).max(1.0)
                 };
-                *rate = wanted.clamp(LEAST_RATE, MOST_RATE);
+                of[class] = wanted.clamp(LEAST_RATE, MOST_RATE);
+                kept[class] = variance * left(of[class], spread);
             }
             price *= 0.625;
         }
