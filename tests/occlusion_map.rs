@@ -40,6 +40,17 @@ fn rates(random: &mut Random) -> Rates {
 }
 
 #[test]
+fn doubts_add_up_what_rays_were_off() {
+    let mut doubts = Doubts::default();
+    doubts.add(Odds { u: 200, class: 3 }, Tally { asked: 5, free: 3 });
+    doubts.add(Odds { u: 0, class: 15 }, Tally { asked: 7, free: 0 });
+    doubts.add(Odds { u: 255, class: 3 }, Tally { asked: u32::MAX, free: 0 });
+    assert_eq!((doubts.asked[3], doubts.asked[15]), (5 + u64::from(u32::MAX), 7));
+    assert_eq!(doubts.squared[3], 3 * 55 * 55 + 2 * 200 * 200 + u64::from(u32::MAX) * 255 * 255);
+    assert_eq!(doubts.squared[15], 0);
+}
+
+#[test]
 fn over_all_places_samples_are_corrected_to_the_mean_visibility() {
     let mut random = Random::new(1);
     let key = CellKey::new([0.0; 3], [0.0, 0.0, 1.0], 0, 0).expect("near");

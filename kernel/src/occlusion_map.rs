@@ -707,13 +707,13 @@ pub struct Doubts {
 }
 
 impl Doubts {
-    /// Counts a ray.
+    /// Counts rays of a bin.
     #[inline(always)]
-    pub fn count(&mut self, odds: Odds, free: bool) {
-        let off = i32::from(odds.u) - if free { 255 } else { 0 };
+    pub fn add(&mut self, odds: Odds, seen: Tally) {
         let class = odds.class as usize & (CLASSES - 1);
-        self.asked[class] += 1;
-        self.squared[class] += (off * off) as u64;
+        let (u, asked, free) = (u64::from(odds.u), u64::from(seen.asked), u64::from(seen.free));
+        self.asked[class] += asked;
+        self.squared[class] += free * (255 - u).pow(2) + asked.saturating_sub(free) * u.pow(2);
     }
 
     /// Adds what another has counted.

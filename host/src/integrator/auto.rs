@@ -526,14 +526,27 @@ impl Map {
     }
 
     fn tally(&self, cell: usize) -> [Tally; BINS] {
-        std::array::from_fn(|bin| {
-            let word = self.tallies[cell * BINS + bin].load(Ordering::Relaxed);
-            Tally { asked: (word >> 32) as u32, free: word as u32 }
-        })
+        std::array::from_fn(|bin| tally(self.tallies[cell * BINS + bin].load(Ordering::Relaxed)))
     }
 
     fn count(&self, place: usize, free: bool) {
-        self.tallies[place].fetch_add(1 << 32 | u64::from(free), Ordering::Relaxed);
+        self.tallies[place].fetch_add(tallied(free), Ordering::Relaxed);
+    }
+
+    /// Notes what a run saw, and how far the odds of its cell were off; and ends it.
+    fn note(&self, run: &mut Run, doubts: &mut Doubts) {
+        let Some(cell) = self.cells.get(run.cell as usize) else { return };
+        let tallies = &self.tallies[run.cell as usize * BINS..][..BINS];
+        while run.seen != 0 {
+            let bin = run.seen.trailing_zeros() as usize;
+            run.seen &= run.seen - 1;
+            let word = std::mem::take(&mut run.words[bin]);
+            tallies[bin].fetch_add(word, Ordering::Relaxed);
+            if cell.is_known() {
+                doubts.add(cell.odds(bin), tally(word));
+            }
+        }
+        run.cell = NOBODY;
     }
 
     /// Takes in what was learned before, as far as there is room.
@@ -728,6 +741,42 @@ impl Map {
         let tests = each(counts.node_tests) + each(counts.triangle_tests);
         let cost = (0.2 * tests.powf(1.4)).max(3.0);
         self.ray = 2f64.powf((4.0 * cost.log2()).round() / 4.0);
+    }
+}
+
+/// A ray as a word of a bin: asked in the upper half, free in the lower.
+#[inline(always)]
+fn tallied(free: bool) -> u64 {
+    1 << 32 | u64::from(free)
+}
+
+/// What such words add up to.
+#[inline(always)]
+fn tally(word: u64) -> Tally {
+    Tally { asked: (word >> 32) as u32, free: word as u32 }
+}
+
+/// What points next to each other saw of a cell: to be noted once for all, since others may be noting too.
+struct Run {
+    cell: u32,
+    /// A bit for each bin in which there is something.
+    seen: u64,
+    words: [u64; BINS],
+}
+
+/// Runs at a time: a tile sees some cells of some lights.
+const RUNS: usize = 16;
+
+impl Run {
+    const NONE: Self = Self { cell: NOBODY, seen: 0, words: [0; BINS] };
+
+    #[inline(always)]
+    fn count(&mut self, bins: &[u8], estimates: &[f32]) {
+        for (&bin, &estimate) in bins.iter().zip(estimates) {
+            let bin = usize::from(bin) % BINS;
+            self.seen |= 1 << bin;
+            self.words[bin] += tallied(estimate > 0.0);
+        }
     }
 }
 
@@ -1180,18 +1229,20 @@ impl Visibility for Auto {
             return;
         }
         let mut doubts = Doubts::default();
+        let mut runs = [const { Run::NONE }; RUNS];
         for (batch, &index) in questions.batches.iter().zip(&questions.cells) {
-            let Some(cell) = map.cells.get(index as usize) else { continue };
-            let first = index as usize * BINS;
-            let samples = batch.samples.start as usize..batch.samples.end as usize;
-            for (&bin, &estimate) in questions.bins[samples.clone()].iter().zip(&estimates[samples]) {
-                let (bin, free) = (usize::from(bin) % BINS, estimate > 0.0);
-                map.count(first + bin, free);
-                if cell.is_known() {
-                    doubts.count(cell.odds(bin), free);
-                }
+            if index as usize >= map.cells.len() {
+                continue;
             }
+            let run = &mut runs[index as usize % RUNS];
+            if run.cell != index {
+                map.note(run, &mut doubts);
+                run.cell = index;
+            }
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            run.count(&questions.bins[samples.clone()], &estimates[samples]);
         }
+        runs.iter_mut().for_each(|run| map.note(run, &mut doubts));
         let mut pasts = map.pasts_of(questions.place);
         let mut sums = Gain::<f64>::default();
         let mut seen = kinds::Seen::default();
