@@ -18,6 +18,7 @@
 //! for points whose rays are their own.
 
 mod draws;
+mod heard;
 mod kinds;
 mod past;
 mod prove;
@@ -27,6 +28,7 @@ mod seed;
 pub use saved::{SavedMap, fingerprint};
 
 use self::draws::{Bins, Draws};
+use self::heard::{Gain, Hear, tallied, tally};
 pub(super) use self::kinds::Kind;
 use self::kinds::Variances;
 use self::past::{Nearby, Past};
@@ -327,97 +329,6 @@ const TELLING: u64 = 64;
 /// Needs are counted in these parts.
 const NEED: f32 = 4096.0;
 
-/// Variances of visibility as samples left them, and as the usual ones would have, weighed by squared light.
-///
-/// Well spread samples leave `v (1 - v) n^-1.5` where borders are long against their distance, and `n^-1` where fine things
-/// are in the way; which of both, a quarter of a light tells: it has half of the variance of the whole, or all of it.
-///
-/// A tile sums numbers, and tiles are summed in whole parts of [`FINE`], so that their order does not matter.
-#[derive(Clone, Copy, Debug, Default)]
-struct Gain<T = u64> {
-    /// With the powers -1 and -1.5.
-    before: [T; 2],
-    left: [T; 2],
-    /// Variances of a sample within quarters of a light, and in all of it.
-    quarters: T,
-    whole: T,
-}
-
-/// Variances are counted in these parts.
-const FINE: f64 = 4_294_967_296.0;
-
-/// Samples of a light before its quarters tell anything.
-const QUARTERED: f32 = 8.0;
-
-impl Gain<f64> {
-    /// Adds a batch of n samples, and `usual` otherwise, that saw `v` of squared light `light`; `forms` are what the form of
-    /// the light adds to the variance, and what is left of that.
-    #[inline(always)]
-    fn add(&mut self, light: f32, v: f32, [n, usual]: [f32; 2], forms: [f32; 2]) -> f32 {
-        let one = v * (1.0 - v) * (n / (n - 1.0));
-        for (k, [n, usual]) in [[n, usual], [n * n.sqrt(), usual * usual.sqrt()]].into_iter().enumerate() {
-            self.before[k] += f64::from(light * (one / usual + forms[0]));
-            self.left[k] += f64::from(light * (one / n + forms[1]));
-        }
-        light * one
-    }
-
-    /// Adds what its quarters saw, where all of it has the variance `whole`.
-    fn add_quarters(&mut self, light: f32, whole: f32, bins: &[u8], estimates: &[f32]) {
-        let (mut asked, mut free) = ([0.0f32; 4], [0.0f32; 4]);
-        for (&bin, &estimate) in bins.iter().zip(estimates) {
-            let quarter = usize::from(bin >> 4 & 2 | bin >> 2 & 1);
-            asked[quarter] += 1.0;
-            free[quarter] += if estimate > 0.0 { 1.0 } else { 0.0 };
-        }
-        let (mut sum, mut samples) = (0.0, 0.0);
-        for (n, free) in asked.into_iter().zip(free).filter(|(n, _)| *n > 1.0) {
-            sum += n * (free / n) * (1.0 - free / n) * (n / (n - 1.0));
-            samples += n;
-        }
-        if samples > 0.0 {
-            self.quarters += f64::from(light * (sum / samples));
-            self.whole += f64::from(whole);
-        }
-    }
-
-    fn counted(&self) -> Gain {
-        let count = |sum: f64| (sum * FINE) as u64;
-        Gain {
-            before: self.before.map(count),
-            left: self.left.map(count),
-            quarters: count(self.quarters),
-            whole: count(self.whole),
-        }
-    }
-}
-
-impl Gain {
-    fn merge(&mut self, other: &Self) {
-        let add = |sum: &mut u64, more: u64| *sum = sum.saturating_add(more);
-        for k in 0..2 {
-            add(&mut self.before[k], other.before[k]);
-            add(&mut self.left[k], other.left[k]);
-        }
-        add(&mut self.quarters, other.quarters);
-        add(&mut self.whole, other.whole);
-    }
-
-    /// How many times less variance there is than the usual samples would leave; none if that cannot be told.
-    fn value(&self) -> Option<f64> {
-        if self.left.contains(&0) {
-            return None;
-        }
-        let each = |k: usize| (self.before[k] as f64 / self.left[k] as f64).ln();
-        let spread = if self.quarters > 0 {
-            (self.whole as f64 / self.quarters as f64).log2().clamp(0.0, 1.0)
-        } else {
-            0.0
-        };
-        Some((each(0) + spread * (each(1) - each(0))).exp())
-    }
-}
-
 /// The variance has to fall by this where cells promise less than that: rays in doubt are dearer, and what was seen says a bit
 /// too much. (Soup sees 1.3, of which its passes need 1.2; forest and hair see 1.6.)
 const MUCH: f64 = 1.4;
@@ -531,22 +442,6 @@ impl Map {
 
     fn count(&self, place: usize, free: bool) {
         self.tallies[place].fetch_add(tallied(free), Ordering::Relaxed);
-    }
-
-    /// Notes what a run saw, and how far the odds of its cell were off; and ends it.
-    fn note(&self, run: &mut Run, doubts: &mut Doubts) {
-        let Some(cell) = self.cells.get(run.cell as usize) else { return };
-        let tallies = &self.tallies[run.cell as usize * BINS..][..BINS];
-        while run.seen != 0 {
-            let bin = run.seen.trailing_zeros() as usize;
-            run.seen &= run.seen - 1;
-            let word = std::mem::take(&mut run.words[bin]);
-            tallies[bin].fetch_add(word, Ordering::Relaxed);
-            if cell.is_known() {
-                doubts.add(cell.odds(bin), tally(word));
-            }
-        }
-        run.cell = NOBODY;
     }
 
     /// Takes in what was learned before, as far as there is room.
@@ -741,42 +636,6 @@ impl Map {
         let tests = each(counts.node_tests) + each(counts.triangle_tests);
         let cost = (0.2 * tests.powf(1.4)).max(3.0);
         self.ray = 2f64.powf((4.0 * cost.log2()).round() / 4.0);
-    }
-}
-
-/// A ray as a word of a bin: asked in the upper half, free in the lower.
-#[inline(always)]
-fn tallied(free: bool) -> u64 {
-    1 << 32 | u64::from(free)
-}
-
-/// What such words add up to.
-#[inline(always)]
-fn tally(word: u64) -> Tally {
-    Tally { asked: (word >> 32) as u32, free: word as u32 }
-}
-
-/// What points next to each other saw of a cell: to be noted once for all, since others may be noting too.
-struct Run {
-    cell: u32,
-    /// A bit for each bin in which there is something.
-    seen: u64,
-    words: [u64; BINS],
-}
-
-/// Runs at a time: a tile sees some cells of some lights.
-const RUNS: usize = 16;
-
-impl Run {
-    const NONE: Self = Self { cell: NOBODY, seen: 0, words: [0; BINS] };
-
-    #[inline(always)]
-    fn count(&mut self, bins: &[u8], estimates: &[f32]) {
-        for (&bin, &estimate) in bins.iter().zip(estimates) {
-            let bin = usize::from(bin) % BINS;
-            self.seen |= 1 << bin;
-            self.words[bin] += tallied(estimate > 0.0);
-        }
     }
 }
 
@@ -1228,64 +1087,17 @@ impl Visibility for Auto {
         if map.plain {
             return;
         }
-        let mut doubts = Doubts::default();
-        let mut runs = [const { Run::NONE }; RUNS];
-        for (batch, &index) in questions.batches.iter().zip(&questions.cells) {
-            if index as usize >= map.cells.len() {
-                continue;
-            }
-            let run = &mut runs[index as usize % RUNS];
-            if run.cell != index {
-                map.note(run, &mut doubts);
-                run.cell = index;
-            }
-            let samples = batch.samples.start as usize..batch.samples.end as usize;
-            run.count(&questions.bins[samples.clone()], &estimates[samples]);
-        }
-        runs.iter_mut().for_each(|run| map.note(run, &mut doubts));
         let mut pasts = map.pasts_of(questions.place);
-        let mut sums = Gain::<f64>::default();
-        let mut seen = kinds::Seen::default();
-        let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.before).zip(&questions.kinds);
-        for (batch, (((&whole, &usual), &before), &kind)) in questions.batches.iter().zip(told) {
-            let point = &questions.points[batch.point as usize];
-            if whole.is_nan() {
-                continue;
-            }
-            let Some(past) = past_of(&mut pasts, point.pixel, batch.light, map.remembered) else { continue };
-            let samples = batch.samples.start as usize..batch.samples.end as usize;
-            let count = samples.len() as f32;
-            let estimates = &mut estimates[samples.clone()];
-            let [all, free] = past::sums(&questions.weights[samples], estimates);
-            let off = if whole.is_finite() { whole - all } else { 0.0 };
-            let v = (free / all).min(1.0);
-            let bins = &questions.bins[batch.samples.start as usize..batch.samples.end as usize];
-            past.mark(v, bins, estimates);
-            past.vary(v, count);
-            seen.add(kind, v, count);
-            // Where rays are the points' own, the map does not give up in any case.
-            if count > 1.0 && !point.firm {
-                let radiance = stage.lights[batch.light as usize].radiance * (all / map.brightest);
-                let light = (point.diffuse * radiance).length_squared();
-                let form = |v: f32| (v * off / all).powi(2);
-                let whole = sums.add(light, v, [count, usual], [form(v), form(v - past.mean())]);
-                if whole > 0.0 && count >= QUARTERED && (batch.point + map.passes).is_multiple_of(4) {
-                    sums.add_quarters(light, whole, bins, estimates);
-                }
-            }
-            let more = past.asked(v, off, before) / all;
-            if more != 0.0 {
-                estimates.iter_mut().for_each(|estimate| *estimate += more);
-            }
-        }
+        let pixels = &mut pasts;
+        let heard = Hear { map: &map, stage, questions, estimates, pasts: pixels }.run();
         if let Some(pasts) = &mut pasts {
-            pasts.needs.gain.merge(&sums.counted());
+            pasts.needs.gain.merge(&heard.gain);
         }
-        if seen != kinds::Seen::default() {
-            self.kinds.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&seen);
+        if heard.kinds != kinds::Seen::default() {
+            self.kinds.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&heard.kinds);
         }
-        if doubts != Doubts::default() {
-            self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&doubts);
+        if heard.doubts != Doubts::default() {
+            self.doubts.lock().unwrap_or_else(|poisoned| poisoned.into_inner()).merge(&heard.doubts);
         }
     }
 
@@ -1341,29 +1153,6 @@ fn worth_learning(passes: u32) -> bool {
 #[cfg(test)]
 mod tests {
     use super::*;
-
-    #[test]
-    fn quarters_tell_fine_things_from_long_borders() {
-        let bins: Vec<u8> = (0..64).collect();
-        let gain = |free: fn(u8) -> bool| {
-            let estimates: Vec<f32> = bins.iter().map(|&bin| f32::from(u8::from(free(bin)))).collect();
-            let v = estimates.iter().sum::<f32>() / 64.0;
-            let mut sums = Gain::<f64>::default();
-            let whole = sums.add(1.0, v, [64.0, 16.0], [0.0; 2]);
-            sums.add_quarters(1.0, whole, &bins, &estimates);
-            (sums.counted().value().expect("both"), sums.quarters / sums.whole)
-        };
-        // A border down the middle of the left half, and a chessboard.
-        let (border, half) = gain(|bin| bin % 8 < 2);
-        assert!((half - 0.7).abs() < 0.01 && border > 5.0 && border < 8.0, "{border} {half}");
-        let (fine, all) = gain(|bin| (bin ^ bin >> 3) & 1 == 0);
-        assert!((all - 1.05).abs() < 0.03 && (fine - 4.0).abs() < 1e-3, "{fine} {all}");
-        // What the light's form adds counts with either power, and nothing seen is nothing told.
-        let mut sums = Gain::<f64>::default();
-        sums.add(2.0, 0.0, [8.0, 8.0], [0.5, 0.25]);
-        assert_eq!(sums.counted().value(), Some(2.0));
-        assert_eq!(Gain::<u64>::default().value(), None);
-    }
 
     #[test]
     fn cells_hear_of_as_many_rays() {
