@@ -1089,7 +1089,7 @@ impl Visibility for Auto {
         }
         let mut pasts = map.pasts_of(questions.place);
         let pixels = &mut pasts;
-        let heard = Hear { map: &map, stage, questions, estimates, pasts: pixels }.run();
+        let heard = dispatch(stage.level, Hear { map: &map, stage, questions, estimates, pasts: pixels });
         if let Some(pasts) = &mut pasts {
             pasts.needs.gain.merge(&heard.gain);
         }

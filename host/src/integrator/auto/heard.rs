@@ -4,6 +4,8 @@ use super::kinds;
 use super::past;
 use super::{Map, NOBODY, TilePast, past_of};
 use crate::integrator::{Questions, Stage};
+use occlude_kernel::Simd;
+use occlude_kernel::lanes::Task;
 use occlude_kernel::occlusion_map::{BINS, Doubts, Tally};
 use std::sync::MutexGuard;
 use std::sync::atomic::Ordering;
@@ -45,12 +47,14 @@ impl Gain<f64> {
 
     /// Adds what its quarters saw, where all of it has the variance `whole`.
     fn add_quarters(&mut self, light: f32, whole: f32, bins: &[u8], estimates: &[f32]) {
-        let (mut asked, mut free) = ([0.0f32; 4], [0.0f32; 4]);
-        for (&bin, &estimate) in bins.iter().zip(estimates) {
-            let quarter = usize::from(bin >> 4 & 2 | bin >> 2 & 1);
-            asked[quarter] += 1.0;
-            free[quarter] += if estimate > 0.0 { 1.0 } else { 0.0 };
+        // Sixteen bits for each quarter: so many samples are enough.
+        let (mut asked, mut free) = (0u64, 0u64);
+        for (&bin, &estimate) in bins.iter().zip(estimates).take(usize::from(u16::MAX)) {
+            let quarter = 1u64 << (bin & 32 | bin << 2 & 16);
+            asked += quarter;
+            free += if estimate > 0.0 { quarter } else { 0 };
         }
+        let [asked, free] = [asked, free].map(|sums| [0, 16, 32, 48].map(|at| (sums >> at & 0xffff) as f32));
         let (mut sum, mut samples) = (0.0, 0.0);
         for (n, free) in asked.into_iter().zip(free).filter(|(n, _)| *n > 1.0) {
             sum += n * (free / n) * (1.0 - free / n) * (n / (n - 1.0));
@@ -170,8 +174,11 @@ pub(super) struct Hear<'a, 'b> {
     pub(super) pasts: &'a mut Option<MutexGuard<'b, TilePast>>,
 }
 
-impl Hear<'_, '_> {
-    pub(super) fn run(self) -> Heard {
+impl Task for Hear<'_, '_> {
+    type Output = Heard;
+
+    #[inline(always)]
+    fn run<S: Simd>(self, _simd: S) -> Heard {
         let Self { map, stage, questions, estimates, pasts } = self;
         let mut doubts = Doubts::default();
         let mut runs = [const { Run::NONE }; RUNS];
