@@ -1,18 +1,21 @@
 //! Builds the tree that the kernel walks, and owns what it borrows.
 //!
-//! obvhs builds a binary tree with one triangle a leaf (PLOC with parallel reinsertion). It is then cut into
-//! nodes of eight children and blocks of up to eight triangles so that the expected cost of a ray, by the
-//! surface area heuristic, is least over all ways of cutting it: the dynamic programme of Ylitie, Karras and
-//! Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs" (HPG 2017), section 3.1.
+//! obvhs builds a binary tree with one triangle a leaf (PLOC), whose subtrees are then put into better places
+//! (`reinsertion`). It is cut into nodes of eight children and blocks of up to eight triangles so that the expected
+//! cost of a ray, by the surface area heuristic, is least over all ways of cutting it: the dynamic programme of
+//! Ylitie, Karras and Laine, "Efficient Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs" (HPG 2017),
+//! section 3.1.
+
+mod reinsertion;
 
 use crate::scene::Scene;
 use glam::Vec3;
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
-use obvhs::bvh2::reinsertion::ReinsertionOptimizer;
 use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 use occlude_kernel::bvh::MAX_DEPTH;
 use occlude_kernel::{Bvh, Child, Node, TriangleBlock};
+use reinsertion::Pairs;
 
 /// How long to look for a good tree.
 #[derive(Clone, Copy, Debug, Default, PartialEq, Eq, clap::ValueEnum)]
@@ -184,9 +187,9 @@ const CROWDED: (f64, usize) = (0.003, 10_000);
 /// large scene is not to take more than twice the time that Embree's best build takes.
 const LARGE: f32 = 2e5;
 
-/// Nodes put into better places, as parts of those of the largest round: thrice from a few large ones to few, since
-/// small ones find better places once the large ones have theirs.
-const ROUNDS: [f32; 11] = [0.25, 0.12, 0.06, 0.5, 0.25, 0.12, 0.06, 1.0, 0.5, 0.25, 0.12];
+/// Nodes that better places are looked for, as parts of those of the largest round: thrice from many to the few that
+/// matter most, since others find better places once those have theirs.
+const ROUNDS: [f32; 11] = [0.4, 0.2, 0.1, 0.6, 0.3, 0.2, 0.1, 1.0, 0.5, 0.3, 0.2];
 
 fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
     let whole = boxes.iter().fold(Aabb::empty(), |whole, b| whole.union(b));
@@ -210,15 +213,18 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
         Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
         Quality::Medium => {
             let fewer = (LARGE / boxes.len() as f32).min(1.0).sqrt();
-            (PlocSearchDistance::Medium, 3, 0.6 * fewer)
+            (PlocSearchDistance::Medium, 3, 0.4 * fewer)
         }
         Quality::High => (PlocSearchDistance::High, 2, 1.0),
     };
     let indices = (0..boxes.len() as u32).collect();
     let mut binary =
         PlocBuilder::with_capacity(boxes.len()).build(distance, &boxes, indices, SortPrecision::U64, depth);
-    ReinsertionOptimizer::default().run(&mut binary, reinsertion, Some(ROUNDS.to_vec()));
-    binary.reorder_in_stack_traversal_order();
+    if boxes.len() > 1 {
+        let mut pairs = Pairs::new(&binary);
+        pairs.improve(reinsertion, &ROUNDS);
+        binary.nodes = pairs.nodes(binary.nodes[0]);
+    }
     Some(binary)
 }
 
