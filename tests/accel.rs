@@ -140,6 +140,8 @@ fn one_huge_and_many_tiny() {
 fn the_same_again() {
     let mut random = Random::new(44);
     let mut soup = meshes::soup(&mut random, 30_000, 0.05);
+    // Far off and deep, so that what is cut apart is of all sizes.
+    soup.extend(meshes::moved(&meshes::soup(&mut random, 3000, 0.05), 1e-3, Vec3::splat(3.0)));
     // Ties too.
     soup.extend_from_within(..3000);
     for quality in QUALITIES {

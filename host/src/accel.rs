@@ -12,9 +12,11 @@ use crate::scene::Scene;
 use glam::Vec3;
 use obvhs::aabb::Aabb;
 use obvhs::bvh2::Bvh2;
+use obvhs::bvh2::node::Bvh2Node;
 use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
 use occlude_kernel::bvh::MAX_DEPTH;
 use occlude_kernel::{Bvh, Child, Node, TriangleBlock};
+use rayon::prelude::*;
 use reinsertion::Pairs;
 
 /// How long to look for a good tree.
@@ -83,9 +85,8 @@ impl Accel {
         let Some(binary) = build_binary(&boxes, quality) else {
             return Self::evenly(triangles, &boxes);
         };
-        let mut cutter = Cutter::new(&binary, triangles);
-        cutter.root();
-        let (nodes, blocks) = (cutter.nodes, cutter.blocks);
+        let plans = plan(&binary);
+        let (nodes, blocks) = cut(&Tree { binary: &binary, plans: &plans, triangles });
         Self { nodes, blocks, triangles: triangles.len() }
     }
 
@@ -103,8 +104,8 @@ impl Accel {
             .collect();
         order.sort_unstable();
         let order: Vec<u32> = order.into_iter().map(|(_, i)| i).collect();
-        let binary = Bvh2::default();
-        let mut cutter = Cutter::new(&binary, triangles);
+        let tree = Tree { binary: &Bvh2::default(), plans: &[], triangles };
+        let mut cutter = Cutter::new(&tree, triangles.len());
         let parts: Vec<&[u32]> =
             order.chunks(order.len().div_ceil(Node::WIDTH).max(TriangleBlock::WIDTH)).collect();
         cutter.place(1, parts.len(), |cutter, part| cutter.even(parts[part], 2));
@@ -229,61 +230,105 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
 }
 
 /// The cheapest way to stand for a subtree by at most `i + 1` children of a node, for `i` from 0 to 6.
-#[derive(Clone, Copy)]
+#[derive(Clone, Copy, Default)]
 struct Plan {
     cost: [f32; 7],
     /// How many of them the left side gets; 0: not split, use one fewer (or, for one, see `leaf`).
     left: [u8; 7],
     /// As one child: the left side's share of the eight in a node of its own; 0: a block of triangles.
     own: u8,
+    /// How many triangles are below.
+    triangles: u32,
 }
 
-fn plan(binary: &Bvh2) -> Vec<Plan> {
-    let nodes = &binary.nodes;
-    let mut plans = vec![Plan { cost: [0.0; 7], left: [0; 7], own: 0 }; nodes.len()];
-    let mut counts = vec![0u32; nodes.len()];
-    for index in (0..nodes.len()).rev() {
-        let node = &nodes[index];
-        let area = half_area(node.aabb().min.into(), node.aabb().max.into());
-        let block = area * BLOCK_COST;
-        if node.is_leaf() {
-            counts[index] = node.prim_count;
-            plans[index].cost = [block; 7];
-            continue;
-        }
-        let (a, b) = (node.first_index as usize, node.first_index as usize + 1);
-        counts[index] = counts[a] + counts[b];
+impl Plan {
+    fn leaf(node: &Bvh2Node) -> Self {
+        let block = node.aabb().half_area() * BLOCK_COST;
+        Self { cost: [block; 7], triangles: node.prim_count, ..Self::default() }
+    }
+
+    fn inner(node: &Bvh2Node, [a, b]: [&Self; 2]) -> Self {
         // Both sides together, with `most` children in all.
         let split = |most: usize| {
-            (1..most)
-                .map(|left| {
-                    let cost = plans[a].cost[left.min(7) - 1] + plans[b].cost[(most - left).min(7) - 1];
-                    (cost, left as u8)
-                })
-                .min_by(|x, y| x.0.total_cmp(&y.0))
-                .unwrap_or((f32::INFINITY, 0))
+            let mut best = (a.cost[0] + b.cost[most - 2], 1);
+            for left in 2..most {
+                let cost = a.cost[left - 1] + b.cost[most - left - 1];
+                if cost < best.0 {
+                    best = (cost, left as u8);
+                }
+            }
+            best
         };
-        let mut plan = Plan { cost: [0.0; 7], left: [0; 7], own: 0 };
-        let (below, left) = split(8);
-        let inner = area * NODE_COST + below;
-        if counts[index] as usize <= TriangleBlock::WIDTH && block <= inner {
+        let mut plan = Self { triangles: a.triangles + b.triangles, ..Self::default() };
+        let area = node.aabb().half_area();
+        let (below, left) = split(Node::WIDTH);
+        let (block, inner) = (area * BLOCK_COST, area * NODE_COST + below);
+        if plan.triangles as usize <= TriangleBlock::WIDTH && block <= inner {
             plan.cost[0] = block;
         } else {
             (plan.cost[0], plan.own) = (inner, left);
         }
-        for most in 2..=7 {
+        for most in 2..Node::WIDTH {
             let (cost, left) = split(most);
             let fewer = plan.cost[most - 2];
             (plan.cost[most - 1], plan.left[most - 1]) = if cost < fewer { (cost, left) } else { (fewer, 0) };
         }
-        plans[index] = plan;
+        plan
     }
+}
+
+/// Plans of all nodes, of which each is followed by all that is below its left side, then by all below its right.
+///
+/// Subtrees are planned at the same time.
+fn plan(binary: &Bvh2) -> Vec<Plan> {
+    let nodes = &binary.nodes;
+    let mut plans = vec![Plan::default(); nodes.len()];
+    // Subtrees that are small enough, and the pairs above them.
+    let (mut small, mut above) = (Vec::new(), Vec::new());
+    let mut waiting: Vec<_> = std::iter::once(1..nodes.len()).collect();
+    while let Some(below) = waiting.pop() {
+        if below.len() <= PLANNED {
+            small.push(below);
+            continue;
+        }
+        let (a, b) = (below.start, below.start + 1);
+        above.push(a);
+        let half = if nodes[b].is_leaf() { below.end } else { nodes[b].first_index as usize };
+        waiting.extend([half..below.end, a + 2..half].into_iter().filter(|part| !part.is_empty()));
+    }
+    // The plan of a node, from those of the nodes from `first` on.
+    let plan = |index: usize, plans: &[Plan], first: usize| {
+        let node = &nodes[index];
+        match node.is_leaf() {
+            true => Plan::leaf(node),
+            false => Plan::inner(node, [0, 1].map(|side| &plans[node.first_index as usize + side - first])),
+        }
+    };
+    let (mut rest, mut at) = (&mut plans[..], 0);
+    let mut parts = Vec::with_capacity(small.len());
+    for below in small {
+        let (part, after) = rest[below.start - at..].split_at_mut(below.len());
+        parts.push((below.start, part));
+        (rest, at) = (after, below.end);
+    }
+    parts.into_par_iter().for_each(|(first, part)| {
+        for index in (0..part.len()).rev() {
+            part[index] = plan(first + index, part, first);
+        }
+    });
+    for first in above.into_iter().rev() {
+        plans[first] = plan(first, &plans, 0);
+        plans[first + 1] = plan(first + 1, &plans, 0);
+    }
+    plans[0] = plan(0, &plans, 0);
     plans
 }
 
 /// What stands below a place of a node.
 struct Below {
     child: Child,
+    /// Or the part that is cut apart; its child is the first node of that.
+    part: Option<usize>,
     lower: Vec3,
     upper: Vec3,
     /// Of all triangles.
@@ -303,57 +348,202 @@ impl Below {
     }
 }
 
-struct Cutter<'a> {
-    plan: Vec<Plan>,
+/// What is cut into nodes and blocks.
+#[derive(Clone, Copy)]
+struct Tree<'a> {
     binary: &'a Bvh2,
+    plans: &'a [Plan],
     triangles: &'a [[Vec3; 3]],
+}
+
+/// What becomes of a subtree that is one child of a node.
+#[derive(PartialEq)]
+enum Way {
+    /// A block, or more of them under nodes of even fill.
+    Even,
+    /// A node of its own.
+    Node,
+    /// The same, but cut apart from what is around it.
+    Part,
+}
+
+impl Tree<'_> {
+    fn way(&self, subtree: usize, level: usize) -> Way {
+        let plan = &self.plans[subtree];
+        // A tree that is too lopsided for the kernel's stack is cut evenly from here on.
+        if plan.own == 0 || level >= MAX_DEPTH - LEVELS_OF_ANY {
+            Way::Even
+        } else if APART.contains(&plan.triangles) {
+            Way::Part
+        } else {
+            Way::Node
+        }
+    }
+
+    /// The subtrees that stand for the children of this one as a node.
+    fn children(&self, subtree: usize) -> Vec<usize> {
+        let left = usize::from(self.plans[subtree].own);
+        let mut parts = Vec::with_capacity(Node::WIDTH);
+        let first = self.binary.nodes[subtree].first_index as usize;
+        self.parts(first, left, &mut parts);
+        self.parts(first + 1, Node::WIDTH - left, &mut parts);
+        parts
+    }
+
+    /// The subtrees that stand for this one in a node with room for `most`.
+    fn parts(&self, subtree: usize, most: usize, parts: &mut Vec<usize>) {
+        let mut most = most.min(7);
+        let plan = &self.plans[subtree];
+        while most > 1 && plan.left[most - 1] == 0 {
+            most -= 1;
+        }
+        if most == 1 {
+            parts.push(subtree);
+            return;
+        }
+        let left = usize::from(plan.left[most - 1]);
+        let first = self.binary.nodes[subtree].first_index as usize;
+        self.parts(first, left, parts);
+        self.parts(first + 1, most - left, parts);
+    }
+
+    /// Subtrees to cut apart, with their levels, in the order in which a cutter comes by.
+    fn apart(&self, subtree: usize, level: usize, found: &mut Vec<(usize, usize)>) {
+        for child in self.children(subtree) {
+            match self.way(child, level + 1) {
+                Way::Even => {}
+                Way::Node => {
+                    if self.plans[child].triangles > *APART.end() {
+                        self.apart(child, level + 1, found);
+                    }
+                }
+                Way::Part => found.push((child, level + 1)),
+            }
+        }
+    }
+
+    /// The triangles of a subtree, in its order.
+    fn below(&self, subtree: usize, triangles: &mut Vec<u32>) {
+        let mut waiting = vec![subtree];
+        triangles.clear();
+        while let Some(index) = waiting.pop() {
+            let node = &self.binary.nodes[index];
+            let first = node.first_index as usize;
+            if node.is_leaf() {
+                triangles.extend_from_slice(
+                    &self.binary.primitive_indices[first..first + node.prim_count as usize],
+                );
+            } else {
+                waiting.extend([first + 1, first]);
+            }
+        }
+    }
+}
+
+/// Cuts a tree. Many parts of it are cut at the same time; which ones depends on nothing but the tree.
+fn cut(tree: &Tree<'_>) -> (Vec<Node>, Vec<TriangleBlock>) {
+    let mut top = Cutter::new(tree, 0);
+    // A root that is a block still needs a node above it.
+    if tree.plans[0].own == 0 {
+        let mut below = Vec::new();
+        tree.below(0, &mut below);
+        top.place(1, 1, |cutter, _| cutter.even(&below, 2));
+        return (top.nodes, top.blocks);
+    }
+    let mut apart = Vec::new();
+    if tree.plans[0].triangles > *APART.end() {
+        tree.apart(0, 1, &mut apart);
+    }
+    let parts: Vec<(Cutter<'_>, Below)> = apart
+        .par_iter()
+        .map(|&(subtree, level)| {
+            let mut cutter = Cutter::new(tree, tree.plans[subtree].triangles as usize);
+            let below = cutter.node(subtree, level);
+            (cutter, below)
+        })
+        .collect();
+    let (parts, mut cut): (Vec<_>, Vec<_>) = parts.into_iter().unzip();
+    cut.iter_mut().zip(0..).for_each(|(below, part)| below.part = Some(part));
+    top.cut = cut.into_iter();
+    top.node(0, 1);
+
+    let (mut nodes, mut blocks) = (top.nodes, top.blocks);
+    nodes.reserve_exact(parts.iter().map(|part| part.nodes.len()).sum());
+    blocks.reserve_exact(parts.iter().map(|part| part.blocks.len()).sum());
+    let firsts = parts.iter().scan(nodes.len(), |first, part| {
+        let this = *first;
+        *first += part.nodes.len();
+        Some(this as u32)
+    });
+    let firsts: Vec<u32> = firsts.collect();
+    for (index, place, part) in top.parts {
+        nodes[index].children[place] = Child::node(firsts[part]);
+    }
+    for (part, first) in parts.into_iter().zip(firsts) {
+        let first_block = blocks.len() as u32;
+        blocks.extend_from_slice(&part.blocks);
+        nodes.extend(part.nodes.into_iter().map(|mut node| {
+            node.children = node.children.map(|child| match (child.as_node(), child.as_leaf()) {
+                (Some(node), _) => Child::node(node as u32 + first),
+                (_, Some(leaf)) => {
+                    Child::lanes(leaf.block as u32 + first_block, leaf.first as u32, leaf.count as u32)
+                }
+                _ => child,
+            });
+            node
+        }));
+    }
+    (nodes, blocks)
+}
+
+struct Cutter<'a> {
+    tree: &'a Tree<'a>,
     nodes: Vec<Node>,
     blocks: Vec<TriangleBlock>,
     /// The last blocks with room, by the lanes that are left.
     room: [Vec<usize>; TriangleBlock::WIDTH],
+    /// Triangles that are being written; kept for its memory.
+    below: Vec<u32>,
+    /// Parts that are cut already, in the order in which they are come by.
+    cut: std::vec::IntoIter<Below>,
+    /// Where they are: node, place and part.
+    parts: Vec<(usize, usize, usize)>,
 }
 
 impl<'a> Cutter<'a> {
-    /// With nothing written yet.
-    fn new(binary: &'a Bvh2, triangles: &'a [[Vec3; 3]]) -> Self {
+    /// With nothing written yet, for about so many triangles.
+    fn new(tree: &'a Tree<'a>, triangles: usize) -> Self {
         Self {
-            plan: plan(binary),
-            binary,
-            triangles,
-            nodes: Vec::with_capacity(triangles.len() / 20 + 1),
-            blocks: Vec::with_capacity(triangles.len() / 7 + 1),
+            tree,
+            nodes: Vec::with_capacity(triangles / 20 + 1),
+            blocks: Vec::with_capacity(triangles / 7 + 1),
             room: Default::default(),
-        }
-    }
-
-    fn root(&mut self) {
-        // A root that is a block still needs a node above it.
-        if self.binary.nodes[0].is_leaf() || self.plan[0].own == 0 {
-            let below = self.below(0);
-            self.place(1, 1, |cutter, _| cutter.even(&below, 2));
-        } else {
-            self.node(0, 1);
+            below: Vec::new(),
+            cut: Vec::new().into_iter(),
+            parts: Vec::new(),
         }
     }
 
     /// Writes the subtree as a node of its own, on this level.
     fn node(&mut self, subtree: usize, level: usize) -> Below {
-        let left = usize::from(self.plan[subtree].own);
-        let mut parts = Vec::with_capacity(Node::WIDTH);
-        let first = self.binary.nodes[subtree].first_index as usize;
-        self.parts(first, left, &mut parts);
-        self.parts(first + 1, Node::WIDTH - left, &mut parts);
-        self.place(level, parts.len(), |cutter, part| {
-            let subtree = parts[part];
-            if cutter.binary.nodes[subtree].is_leaf() || cutter.plan[subtree].own == 0 {
-                return cutter.even(&cutter.below(subtree), level + 1);
+        let children = self.tree.children(subtree);
+        self.place(level, children.len(), |cutter, place| {
+            let subtree = children[place];
+            match cutter.tree.way(subtree, level + 1) {
+                Way::Even => {
+                    let mut below = std::mem::take(&mut cutter.below);
+                    cutter.tree.below(subtree, &mut below);
+                    let placed = cutter.even(&below, level + 1);
+                    cutter.below = below;
+                    placed
+                }
+                // What is within a part is no part again.
+                Way::Part => match cutter.cut.next() {
+                    Some(part) => part,
+                    None => cutter.node(subtree, level + 1),
+                },
+                Way::Node => cutter.node(subtree, level + 1),
             }
-            // A tree that is too lopsided for the kernel's stack is cut evenly from here on.
-            if level + 1 >= MAX_DEPTH - LEVELS_OF_ANY {
-                let below = cutter.below(subtree);
-                return cutter.even(&below, level + 1);
-            }
-            cutter.node(subtree, level + 1)
         })
     }
 
@@ -371,8 +561,9 @@ impl<'a> Cutter<'a> {
         // Rays that any triangle blocks are soonest done so (RTSAH; Ize and Hansen, "RTSAH Traversal Order for Occlusion
         // Rays", 2011).
         below.sort_by(|a, b| b.worth().total_cmp(&a.worth()));
-        for (place, Below { child, lower, upper, .. }) in below.iter().enumerate() {
+        for (place, Below { child, part, lower, upper, .. }) in below.iter().enumerate() {
             self.nodes[index].set(place, lower.to_array(), upper.to_array(), *child);
+            self.parts.extend(part.map(|part| (index, place, part)));
         }
         let lower = below.iter().fold(Vec3::splat(f32::INFINITY), |lower, below| lower.min(below.lower));
         let upper = below.iter().fold(Vec3::splat(f32::NEG_INFINITY), |upper, below| upper.max(below.upper));
@@ -380,47 +571,12 @@ impl<'a> Cutter<'a> {
         let visits = |below: &Below| below.visits * half_area(below.lower, below.upper) / whole;
         Below {
             child: Child::node(index as u32),
+            part: None,
             lower,
             upper,
             area: below.iter().map(|below| below.area).sum(),
             visits: NODE_COST + below.iter().map(visits).sum::<f32>(),
         }
-    }
-
-    /// The subtrees that stand for this one in a node with room for `most`.
-    fn parts(&self, subtree: usize, most: usize, parts: &mut Vec<usize>) {
-        let mut most = most.min(7);
-        let plan = &self.plan[subtree];
-        while most > 1 && plan.left[most - 1] == 0 {
-            most -= 1;
-        }
-        if most == 1 {
-            parts.push(subtree);
-            return;
-        }
-        let left = usize::from(plan.left[most - 1]);
-        let first = self.binary.nodes[subtree].first_index as usize;
-        self.parts(first, left, parts);
-        self.parts(first + 1, most - left, parts);
-    }
-
-    /// The triangles of a subtree, in its order.
-    fn below(&self, subtree: usize) -> Vec<u32> {
-        let mut triangles = Vec::new();
-        let mut stack = vec![subtree];
-        while let Some(index) = stack.pop() {
-            let node = &self.binary.nodes[index];
-            if node.is_leaf() {
-                let first = node.first_index as usize;
-                triangles.extend_from_slice(
-                    &self.binary.primitive_indices[first..first + node.prim_count as usize],
-                );
-            } else {
-                stack.push(node.first_index as usize + 1);
-                stack.push(node.first_index as usize);
-            }
-        }
-        triangles
     }
 
     /// Writes triangles as blocks under nodes of even fill.
@@ -458,18 +614,19 @@ impl<'a> Cutter<'a> {
         let block = &mut self.blocks[index];
         let (mut lower, mut upper) = (Vec3::splat(f32::INFINITY), Vec3::splat(f32::NEG_INFINITY));
         for (lane, &triangle) in triangles.iter().enumerate() {
-            let vertices = self.triangles[triangle as usize];
+            let vertices = self.tree.triangles[triangle as usize];
             block.set(first + lane, vertices.map(|vertex| vertex.to_array()), triangle);
             for vertex in vertices {
                 (lower, upper) = (lower.min(vertex), upper.max(vertex));
             }
         }
         let area = |&triangle: &u32| {
-            let [a, b, c] = self.triangles[triangle as usize];
+            let [a, b, c] = self.tree.triangles[triangle as usize];
             0.5 * (b - a).cross(c - a).length()
         };
         Below {
             child: Child::lanes(index as u32, first as u32, count as u32),
+            part: None,
             lower,
             upper,
             area: triangles.iter().map(area).sum(),
@@ -480,6 +637,12 @@ impl<'a> Cutter<'a> {
 
 /// A leaf shares a block with leaves that were written lately: this many blocks ago, at most.
 const NEAR: usize = 64;
+
+/// Nodes that a thread plans for at a time, at most.
+const PLANNED: usize = 8192;
+
+/// Subtrees of so many triangles are cut apart from each other. Smaller ones would leave blocks with room.
+const APART: std::ops::RangeInclusive<u32> = 512..=4096;
 
 /// Levels that suffice for any number of triangles cut evenly: eight to the eleventh is more than an index holds.
 const LEVELS_OF_ANY: usize = 11;
