@@ -131,7 +131,8 @@ impl Pairs {
                 let above = |node: u32| self.pairs[split(node).0].above;
                 let near =
                     [from, from ^ 1, to, above(from), above(to)].map(|node| (node as usize).min(nodes));
-                if near.iter().all(|&node| changed[node] != round) {
+                // One that has gone there since may have taken the place along.
+                if near.iter().all(|&node| changed[node] != round) && !self.is_below(to, from) {
                     for node in near {
                         changed[node] = round;
                         self.settled.get_mut(node).into_iter().for_each(|settled| *settled = false);
@@ -218,7 +219,15 @@ impl Pairs {
         (search.best.to != TOP).then_some(search.best)
     }
 
-    /// Moves a subtree beside another.
+    /// Is a node the other one, or anywhere below it?
+    fn is_below(&self, mut node: u32, other: u32) -> bool {
+        while node != TOP && node != other {
+            node = self.pairs[split(node).0].above;
+        }
+        node == other
+    }
+
+    /// Moves a subtree beside another that is not below it.
     fn reinsert(&mut self, from: u32, to: u32) {
         let (at, side) = split(from);
         let above = self.pairs[at].above;
