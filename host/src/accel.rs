@@ -221,10 +221,13 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
     let indices = (0..boxes.len() as u32).collect();
     let mut binary =
         PlocBuilder::with_capacity(boxes.len()).build(distance, &boxes, indices, SortPrecision::U64, depth);
-    if boxes.len() > 1 {
+    drop(boxes);
+    if binary.nodes.len() > 1 {
         let mut pairs = Pairs::new(&binary);
+        // In large scenes there is not much room for both.
+        let root = std::mem::take(&mut binary.nodes)[0];
         pairs.improve(reinsertion, &ROUNDS);
-        binary.nodes = pairs.nodes(binary.nodes[0]);
+        binary.nodes = pairs.nodes(root);
     }
     Some(binary)
 }
@@ -233,7 +236,7 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
 #[derive(Clone, Copy, Default)]
 struct Plan {
     cost: [f32; 7],
-    /// How many of them the left side gets; 0: not split, use one fewer (or, for one, see `leaf`).
+    /// How many of them the left side gets; 0: not split, use one fewer (or, for one, see `own`).
     left: [u8; 7],
     /// As one child: the left side's share of the eight in a node of its own; 0: a block of triangles.
     own: u8,

@@ -469,7 +469,7 @@ impl MapCell {
     fn set_odds(&mut self, expected: &[f32; BINS], rates: &Rates) {
         self.class = classes(expected);
         for (u, &p) in self.u.iter_mut().zip(expected) {
-            *u = if p < 0.5 { 0 } else { (p * 255.0 + 0.5) as i32 as u8 };
+            *u = if p < 0.5 { 0 } else { (p * 255.0 + 0.5).min(255.0) as i32 as u8 };
         }
         self.mean = self.u.iter().map(|&u| u32::from(u)).sum::<u32>() as f32 / BINS as f32;
         let alike = self.u == [self.u[0]; BINS] && self.class == [self.class[0]; BINS];
@@ -560,9 +560,9 @@ pub struct Rates {
 }
 
 impl Rates {
-    /// The same for all, above 0.
+    /// The same for all: from a millionth to a million.
     pub fn each(rate: f32) -> Self {
-        let rate = rate.max(1.0 / (1 << 20) as f32);
+        let rate = rate.max(1e-6).clamp(1e-6, 1e6);
         let [of, left] = [rate, UNSURE as f32 * left(rate, 1.0)].map(|each| [[each; CLASSES]; LEVELS]);
         Self { of, left, best: 0, variance: [UNSURE as f32; CLASSES], spread: 1.0 }
     }

@@ -113,7 +113,7 @@ impl Pairs {
     pub(super) fn improve(&mut self, part: f32, rounds: &[f32]) {
         let nodes = 2 * self.pairs.len();
         // In which round a node was changed; the last one is what the top is below.
-        let mut changed = vec![0; nodes + 1];
+        let mut changed = vec![0u8; nodes + 1];
         for (&share, round) in rounds.iter().zip(1..) {
             let most = nodes as f32 * part;
             let wanted = self.wanted((most * share) as usize, (most * ALWAYS) as usize);
@@ -406,4 +406,82 @@ fn both(boxes: &Boxes) -> Boxes {
 #[inline(always)]
 fn union(a: &Boxes, b: &Boxes) -> Boxes {
     [0, 1, 2].map(|axis| a[axis].min(b[axis]))
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::sampler::Sampler;
+    use obvhs::ploc::{PlocBuilder, PlocSearchDistance, SortPrecision};
+
+    /// Boxes of so many sizes, of which some are in the same place.
+    fn tree(leaves: u32, random: &mut Sampler) -> Bvh2 {
+        let boxes: Vec<Aabb> = (0..leaves)
+            .map(|k| {
+                let mut at =
+                    |scale: f32| Vec3A::new(random.uniform(), random.uniform(), random.uniform()) * scale;
+                let (place, size) = (at(1.0), at([0.01, 0.3, 2.0][k as usize % 3]));
+                let place = if k % 7 == 0 { Vec3A::splat(0.5) } else { place };
+                Aabb::new(place - size, place + size)
+            })
+            .collect();
+        let indices = (0..leaves).collect();
+        PlocBuilder::with_capacity(boxes.len()).build(
+            PlocSearchDistance::Low,
+            &boxes,
+            indices,
+            SortPrecision::U64,
+            2,
+        )
+    }
+
+    /// That links and boxes are right, and every leaf is there once; the sum of all areas.
+    fn checked(pairs: &Pairs) -> f32 {
+        let mut leaves = vec![0; pairs.pairs.len() + 1];
+        let mut waiting = vec![(pairs.top as usize, TOP)];
+        let (mut seen, mut sum) = (0, 0.0);
+        while let Some((at, above)) = waiting.pop() {
+            let pair = &pairs.pairs[at];
+            seen += 1;
+            assert!(seen <= pairs.pairs.len(), "below itself");
+            assert_eq!(pair.above, above);
+            if above != TOP {
+                let (over, side) = split(above);
+                assert_eq!(one(&pairs.pairs[over].boxes, side), both(&pair.boxes), "no more and no less");
+            }
+            sum += areas(&pair.boxes).iter().sum::<f32>();
+            for side in 0..2 {
+                match inner(pair.below[side]) {
+                    Some(below) => waiting.push((below, node(at, side))),
+                    None => leaves[(pair.below[side] & !LEAF) as usize] += 1,
+                }
+            }
+        }
+        assert_eq!(seen, pairs.pairs.len());
+        assert!(leaves.iter().all(|&times| times == 1), "{leaves:?}");
+        sum
+    }
+
+    #[test]
+    fn trees_stay_whole_and_get_smaller() {
+        let mut random = Sampler::from_key(3);
+        let (mut before, mut after) = (0.0, 0.0);
+        for leaves in (2..40).chain([100, 300, 1000, 3000]) {
+            let binary = tree(leaves, &mut random);
+            let mut pairs = Pairs::new(&binary);
+            let first = checked(&pairs);
+            let mut last = first;
+            for share in [1.0, 0.3, 1.0, 0.1] {
+                pairs.improve(1.0, &[share]);
+                let next = checked(&pairs);
+                assert!(next <= last * 1.02, "{leaves} leaves: {next} after {last}");
+                last = next;
+            }
+            (before, after) = (before + first, after + last);
+            let nodes = pairs.nodes(binary.nodes[0]);
+            assert_eq!(nodes.len(), binary.nodes.len());
+            assert_eq!(nodes.iter().filter(|node| node.is_leaf()).count(), leaves as usize);
+        }
+        assert!(after < 0.97 * before, "{after} of {before}");
+    }
 }

@@ -3,7 +3,7 @@
 use super::kinds;
 use super::past;
 use super::{Map, NOBODY, TilePast, past_of};
-use crate::integrator::{Questions, Stage};
+use crate::integrator::{Batch, Questions, Stage};
 use occlude_kernel::Simd;
 use occlude_kernel::lanes::Task;
 use occlude_kernel::occlusion_map::{BINS, Doubts, Tally};
@@ -140,6 +140,27 @@ impl Run {
 }
 
 impl Map {
+    /// Tells cells what batches saw, each of the cell beside it, and says how far their odds were off.
+    #[inline(always)]
+    fn tell(&self, batches: &[Batch], cells: &[u32], bins: &[u8], estimates: &[f32]) -> Doubts {
+        let mut doubts = Doubts::default();
+        let mut runs = [const { Run::NONE }; RUNS];
+        for (batch, &index) in batches.iter().zip(cells) {
+            if index as usize >= self.cells.len() {
+                continue;
+            }
+            let run = &mut runs[index as usize % RUNS];
+            if run.cell != index {
+                self.note(run, &mut doubts);
+                run.cell = index;
+            }
+            let samples = batch.samples.start as usize..batch.samples.end as usize;
+            run.count(&bins[samples.clone()], &estimates[samples]);
+        }
+        runs.iter_mut().for_each(|run| self.note(run, &mut doubts));
+        doubts
+    }
+
     /// Notes what a run saw, and how far the odds of its cell were off; and ends it.
     fn note(&self, run: &mut Run, doubts: &mut Doubts) {
         let Some(cell) = self.cells.get(run.cell as usize) else { return };
@@ -180,21 +201,7 @@ impl Task for Hear<'_, '_> {
     #[inline(always)]
     fn run<S: Simd>(self, _simd: S) -> Heard {
         let Self { map, stage, questions, estimates, pasts } = self;
-        let mut doubts = Doubts::default();
-        let mut runs = [const { Run::NONE }; RUNS];
-        for (batch, &index) in questions.batches.iter().zip(&questions.cells) {
-            if index as usize >= map.cells.len() {
-                continue;
-            }
-            let run = &mut runs[index as usize % RUNS];
-            if run.cell != index {
-                map.note(run, &mut doubts);
-                run.cell = index;
-            }
-            let samples = batch.samples.start as usize..batch.samples.end as usize;
-            run.count(&questions.bins[samples.clone()], &estimates[samples]);
-        }
-        runs.iter_mut().for_each(|run| map.note(run, &mut doubts));
+        let doubts = map.tell(&questions.batches, &questions.cells, &questions.bins, estimates);
         let mut sums = Gain::<f64>::default();
         let mut seen = kinds::Seen::default();
         let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.before).zip(&questions.kinds);
@@ -236,6 +243,58 @@ impl Task for Hear<'_, '_> {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::sampler::Sampler;
+    use occlude_kernel::occlusion_map::{CellKey, MapCell, Rates};
+    use std::sync::atomic::AtomicU64;
+
+    #[test]
+    fn cells_are_told_of_every_ray_once() {
+        let mut random = Sampler::from_key(7);
+        let mut below = |n: usize| (random.uniform() * n as f32) as usize;
+        let cell = |k: usize| {
+            let key = CellKey::new([k as f32, 0.0, 0.0], [0.0, 1.0, 0.0], 0, 0).expect("near");
+            let mut cell = MapCell::new(key, [0.0, 1.0, 0.0]);
+            // One in three knows nothing yet.
+            let odds = std::array::from_fn(|bin| bin as f32 / BINS as f32);
+            cell.learn((k % 3 > 0).then_some(&odds), &Rates::each(1.0));
+            cell
+        };
+        // Some share a place among the runs, and the last ones of what is named are not there.
+        let map = Map {
+            cells: (0..3 * RUNS + 5).map(cell).collect(),
+            tallies: (0..(3 * RUNS + 5) * BINS).map(|_| AtomicU64::new(tallied(true))).collect(),
+            ..Map::default()
+        };
+        let (mut batches, mut cells, mut bins, mut estimates) = (vec![], vec![], vec![], vec![]);
+        for point in 0..500 {
+            let first = bins.len() as u32;
+            bins.extend((0..below(80)).map(|_| below(BINS) as u8));
+            estimates.extend((first..bins.len() as u32).map(|_| below(2) as f32));
+            let samples = first..bins.len() as u32;
+            batches.push(Batch { point, light: point % 3, samples, share: 1.0 });
+            let last = cells.last().copied().unwrap_or(NOBODY);
+            cells.push([last, NOBODY, below(3 * RUNS + 8) as u32][below(3)]);
+        }
+        let doubts = map.tell(&batches, &cells, &bins, &estimates);
+        let mut expected: Vec<u64> = vec![tallied(true); map.tallies.len()];
+        let mut off = Doubts::default();
+        for (batch, &cell) in
+            batches.iter().zip(&cells).filter(|(_, cell)| (**cell as usize) < map.cells.len())
+        {
+            for k in batch.samples.start as usize..batch.samples.end as usize {
+                let (bin, free) = (usize::from(bins[k]), estimates[k] > 0.0);
+                expected[cell as usize * BINS + bin] += tallied(free);
+                let cell = &map.cells[cell as usize];
+                if cell.is_known() {
+                    off.add(cell.odds(bin), tally(tallied(free)));
+                }
+            }
+        }
+        let told: Vec<u64> = map.tallies.iter().map(|word| word.load(Ordering::Relaxed)).collect();
+        assert_eq!(told, expected);
+        assert_eq!(doubts, off);
+        assert!(doubts.asked.iter().sum::<u64>() > 1000);
+    }
 
     #[test]
     fn quarters_tell_fine_things_from_long_borders() {
