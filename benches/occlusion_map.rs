@@ -39,7 +39,7 @@ fn tallies(cell: usize) -> [Tally; BINS] {
 fn rates() -> Rates {
     let mut doubts = Doubts::default();
     for (class, (asked, squared)) in doubts.asked.iter_mut().zip(&mut doubts.squared).enumerate() {
-        (*asked, *squared) = (10_000, 10_000 * 255 * 255 / 5 >> class);
+        (*asked, *squared) = (10_000, (10_000 * 255 * 255 / 5) >> class);
     }
     doubts.rates(0.06)
 }

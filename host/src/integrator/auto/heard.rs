@@ -256,7 +256,7 @@ mod tests {
             let mut cell = MapCell::new(key, [0.0, 1.0, 0.0]);
             // One in three knows nothing yet.
             let odds = std::array::from_fn(|bin| bin as f32 / BINS as f32);
-            cell.learn((k % 3 > 0).then_some(&odds), &Rates::each(1.0));
+            cell.learn((!k.is_multiple_of(3)).then_some(&odds), &Rates::each(1.0));
             cell
         };
         // Some share a place among the runs, and the last ones of what is named are not there.
