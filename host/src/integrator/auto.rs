@@ -16,6 +16,12 @@
 //!
 //! Where neither promises anything, in pictures that are penumbra all over and alike, all is left to the exact method, but
 //! for points whose rays are their own.
+//!
+//! Cells are of one size, some pixels across, and keep no lists of what may block there. Both were measured (AVX-512, Zen 5).
+//! With the best of four sizes for each of ten scenes, 64 rays would gain 4.2 in the mean instead of 4.0; the sizes by themselves,
+//! 2, 4, 8 and 16 pixels, gain 3.7, 4.0, 3.8 and 3.6. Tiles that were handed what their shafts had found the time before, complete
+//! lists and subtrees, took 0.98 of the time with 16 rays a point and 1.01 with 64 (six scenes), and those that were handed
+//! the triangles learned the time before 1.00: finding them anew costs no more than keeping them.
 
 mod draws;
 mod heard;
