@@ -562,6 +562,7 @@ pub struct Rates {
 impl Rates {
     /// The same for all: from a millionth to a million.
     pub fn each(rate: f32) -> Self {
+        // Not a number is the least.
         let rate = rate.max(1e-6).clamp(1e-6, 1e6);
         let [of, left] = [rate, UNSURE as f32 * left(rate, 1.0)].map(|each| [[each; CLASSES]; LEVELS]);
         Self { of, left, best: 0, variance: [UNSURE as f32; CLASSES], spread: 1.0 }
