@@ -330,6 +330,9 @@ impl<S: Simd> Bvh<'_, S> {
             }
             from += S::Packet::WIDTH;
         }
+        if ask.count_ones() as usize >= MOST / 2 {
+            stream.surround(self.simd, self.magnitude);
+        }
         self.stream_blocked(stream, start, ask, part, counter, learner)
     }
 }

@@ -21,7 +21,9 @@
 
 mod abreast;
 mod batch;
+mod beams;
 mod cover;
+mod hull;
 mod occluders;
 mod packet;
 mod part;

@@ -2,10 +2,12 @@
 //!
 //! They are kept number by number, so that at a node or a block either each of a few rays can be tested against all boxes
 //! or triangles at once, or each box or triangle against a vector of rays: whichever is less work there. What takes time
-//! besides the tests, above all guessing wrongly what comes next, is shared by all rays that come to a place.
+//! besides the tests, above all guessing wrongly what comes next, is shared by all rays that come to a place. Of rays
+//! that go together, what they have in common ([`super::hull`]) tells first which boxes and triangles need a test.
 
+use super::hull::Hull;
 use super::packet::{FEW_AT_BLOCK, FEW_AT_NODE, Rays, Ready, transposed};
-use super::pyramid::{Learner, MOST};
+use super::pyramid::{Learner, MOST, greatest_of, least_of};
 use super::slabs::{PacketSlabs, Slabs};
 use super::{ALL_LANES, Bvh, Child, Node, Part, STACK};
 use crate::counter::Counter;
@@ -13,6 +15,7 @@ use crate::lanes::{Lanes, Mask, Simd};
 use crate::triangle::{Axes, NO_TRIANGLE, Sheared, Single, TriangleBlock, Turn};
 use crate::vec3x::{self, Vec3x};
 use arrayvec::ArrayVec;
+use glam::Vec3;
 
 /// Segments, of which `t` runs from 0 to 1.
 pub(super) struct Stream {
@@ -28,6 +31,11 @@ pub(super) struct Stream {
     shear: [[f32; MOST]; 3],
     /// Rays by dominant axis.
     along: [u64; 3],
+    /// Around all rays, where that was asked for.
+    hull: Option<Hull>,
+    /// Nodes and blocks that the last rays came to, and how many of the rays came to each.
+    pub(super) visits: u32,
+    pub(super) comers: u32,
 }
 
 impl Stream {
@@ -41,18 +49,69 @@ impl Stream {
         direction: [[0.0; MOST]; 3],
         shear: [[0.0; MOST]; 3],
         along: [0; 3],
+        hull: None,
+        visits: 0,
+        comers: 0,
     };
 
     /// For other rays.
     #[inline(always)]
     pub(super) fn clear(&mut self) {
         self.along = [0; 3];
+        self.hull = None;
     }
 
     /// All rays that may hit something.
     #[inline(always)]
     fn every(&self) -> u64 {
         self.along[0] | self.along[1] | self.along[2]
+    }
+
+    /// Finds what all rays have in common. Takes as long as testing all of them once; pays where they go together.
+    #[inline(always)]
+    pub(super) fn surround<S: Simd>(&mut self, simd: S, magnitude: f32) {
+        type P<S> = <S as Simd>::Packet;
+        let token = simd.token();
+        let every = self.every();
+        if every == 0 {
+            return;
+        }
+        let one = every.trailing_zeros() as usize;
+        let full = u64::MAX >> (64 - P::<S>::WIDTH);
+        let (mut begin, mut end) = ([Vec3::ZERO; 2], [Vec3::ZERO; 2]);
+        let mut axis = 0;
+        while axis < 3 {
+            let (origin, direction) = (&self.origin[axis], &self.direction[axis]);
+            let some = [origin[one], origin[one] + direction[one]];
+            let (mut low, mut high) = (some, some);
+            let some = [P::<S>::splat(token, some[0]), P::<S>::splat(token, some[1])];
+            let (mut least, mut most) = (some, some);
+            let mut from = 0;
+            while from < MOST {
+                let mut rays = every >> from & full;
+                if rays == full {
+                    let origin = P::<S>::load(token, &origin[from..]);
+                    let end = origin + P::<S>::load(token, &direction[from..]);
+                    (least, most) =
+                        ([least[0].min(origin), least[1].min(end)], [most[0].max(origin), most[1].max(end)]);
+                    rays = 0;
+                }
+                while rays != 0 {
+                    let ray = (from + rays.trailing_zeros() as usize) & (MOST - 1);
+                    rays &= rays - 1;
+                    let (origin, end) = (origin[ray], origin[ray] + direction[ray]);
+                    (low, high) =
+                        ([low[0].min(origin), low[1].min(end)], [high[0].max(origin), high[1].max(end)]);
+                }
+                from += P::<S>::WIDTH;
+            }
+            begin[0][axis] = least_of(least[0]).min(low[0]);
+            begin[1][axis] = greatest_of(most[0]).max(high[0]);
+            end[0][axis] = least_of(least[1]).min(low[1]);
+            end[1][axis] = greatest_of(most[1]).max(high[1]);
+            axis += 1;
+        }
+        self.hull = Hull::new(begin, end, magnitude);
     }
 
     #[inline(always)]
@@ -171,7 +230,7 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     pub(super) fn stream_blocked(
         &self,
-        stream: &Stream,
+        stream: &mut Stream,
         start: &Start<'_>,
         ask: u64,
         part: impl Part,
@@ -190,7 +249,7 @@ impl<S: Simd> Bvh<'_, S> {
     #[inline(always)]
     fn stream_goes(
         &self,
-        stream: &Stream,
+        stream: &mut Stream,
         start: &Start<'_>,
         ask: u64,
         part: impl Part,
@@ -211,6 +270,7 @@ impl<S: Simd> Bvh<'_, S> {
         }
         // The tests are large, so they stand here once, for what is given as for what is come to.
         let (mut blocks, mut nodes) = (0, start.nodes.len());
+        let (mut visits, mut comers) = (0, 0);
         while free != 0 {
             let (block, node, meet);
             // Is this the last of the given nodes?
@@ -234,6 +294,8 @@ impl<S: Simd> Bvh<'_, S> {
                     (None, Some(&self.nodes[next.index()]))
                 };
             }
+            visits += 1;
+            comers += meet.count_ones();
             if let Some(block) = block {
                 free &= !self.stream_at_block(stream, block, meet, part, counter, learner);
             } else if let Some(node) = node {
@@ -243,6 +305,7 @@ impl<S: Simd> Bvh<'_, S> {
                 }
             }
         }
+        (stream.visits, stream.comers) = (visits, comers);
         ask & !free
     }
 
@@ -262,6 +325,13 @@ impl<S: Simd> Bvh<'_, S> {
         let mut blocked = 0;
         // How many rays the triangle in each lane blocks.
         let mut blocks = [0u32; 8];
+        let lanes = match &stream.hull {
+            Some(hull) if meet.count_ones() > FEW_AT_BLOCK => {
+                counter.triangle_tests(part.count(block, lanes));
+                lanes & hull.triangles(self.simd, block)
+            }
+            _ => lanes,
+        };
         let mut left = meet;
         while left != 0 {
             let from = left.trailing_zeros() as usize / width * width;
@@ -333,7 +403,16 @@ impl<S: Simd> Bvh<'_, S> {
     ) {
         let token = self.simd.token();
         let width = S::Packet::WIDTH;
-        counter.node_tests(node.len() * meet.count_ones());
+        // Children that may be met at all.
+        let (mut near, mut tests) = (0xff, node.len());
+        if let Some(hull) = &stream.hull
+            && meet.count_ones() > FEW_AT_NODE
+        {
+            counter.node_tests(tests);
+            near = hull.children(self.simd, node);
+            tests = near.count_ones().min(tests);
+        }
+        counter.node_tests(tests * meet.count_ones());
         // The rays of each child, and the children of any.
         let (mut meets, mut any) = ([0u64; 8], 0);
         let mut entry = [0.0; 8];
@@ -366,14 +445,15 @@ impl<S: Simd> Bvh<'_, S> {
             } else {
                 let slabs = stream.packet_slabs::<S::Packet>(token, from);
                 let end = S::Packet::splat(token, 1.0);
-                let mut place = 0;
-                while place < Node::WIDTH {
+                let mut rest = near;
+                while rest != 0 {
+                    let place = rest.trailing_zeros() as usize & 7;
+                    rest &= rest - 1;
                     if node.children[place] != Child::NONE {
                         let met = slabs.meet(token, node, place, end).0.bits() & rays;
                         these |= u32::from(met != 0) << place;
                         meets[place] |= u64::from(met) << from;
                     }
-                    place += 1;
                 }
                 any |= these;
             }

@@ -6,10 +6,12 @@
 //! a point, long lists and subtrees are cut down by narrower shafts for parts of the points; with few, long lists of which
 //! most matter make room for the subtrees. Then the points are asked: abreast against a list
 //! ([`super::abreast`]), or from the subtrees on, up to 64 rays together ([`super::stream`]), where the triangles that
-//! blocked anything for one point are asked first for the next.
+//! blocked anything for one point are asked first for the next. What these leave open goes together with the same point's
+//! rays, or, where much is in the way of a large light, with other points' to the same part of it ([`super::beams`]).
 
 use super::abreast::{Abreast, Flat};
 use super::batch::{BatchScratch, FEW, targets_from};
+use super::beams::Beams;
 use super::occluders::Walls;
 use super::packet::Rays;
 use super::pyramid::{Forgetful, Going, Learner, MOST};
@@ -35,7 +37,7 @@ pub struct TilePoint {
     pub count: u32,
 }
 
-/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About sixty kilobytes.
+/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About ninety kilobytes.
 pub struct TileScratch {
     batch: BatchScratch,
     cut: Cut,
@@ -49,6 +51,7 @@ pub struct TileScratch {
     sheet: Option<Place>,
     /// For how many tiles with long lists to come these are not asked.
     thick: u32,
+    beams: Beams,
 }
 
 impl TileScratch {
@@ -65,6 +68,7 @@ impl TileScratch {
             inner: List::EMPTY,
             sheet: None,
             thick: 0,
+            beams: Beams::NOTHING,
         }
     }
 }
@@ -297,6 +301,9 @@ impl Packet {
 /// Points with fewer rays go down with their neighbours' from the start, where there is no complete list.
 const MIXED: usize = 12;
 
+/// Points with fewer rays do not sort them.
+const SORTED: usize = 6;
+
 /// Points with as many or fewer share what the learned triangles leave open.
 const SHARED: usize = 32;
 
@@ -325,6 +332,7 @@ struct Work<'w> {
     packet: &'w mut Packet,
     abreast: &'w mut Abreast,
     walls: &'w mut Walls,
+    beams: &'w mut Beams,
 }
 
 /// Steps a shaft may take for each ray of its tile, and at most.
@@ -398,8 +406,19 @@ impl<S: Simd> Bvh<'_, S> {
             fill_all(blocked, points);
             return;
         }
-        let TileScratch { batch, cut, given, learned, packet, abreast, inner_cut, inner, sheet, thick } =
-            scratch;
+        let TileScratch {
+            batch,
+            cut,
+            given,
+            learned,
+            packet,
+            abreast,
+            inner_cut,
+            inner,
+            sheet,
+            thick,
+            beams,
+        } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
             Some(shaft) => self.gather(shaft, &self.nodes[..1], rays, points.len(), cut, given, counter),
@@ -420,9 +439,14 @@ impl<S: Simd> Bvh<'_, S> {
             fill_all(blocked, points);
             return;
         }
-        let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls };
+        match &shaft {
+            Some(shaft) if rays >= SORTED * points.len() => beams.aim(shaft, rays / points.len()),
+            _ => beams.skip(),
+        }
+        let parts = complete || !beams.instead_of_parts();
+        let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls, beams };
         let fine = rays >= FINE * points.len();
-        let apart = fine && points.len() > PART && !(complete && given.count <= SHORT);
+        let apart = fine && parts && points.len() > PART && !(complete && given.count <= SHORT);
         let Some(whole) = shaft.as_ref().filter(|_| apart) else {
             let shaft = shaft.as_ref();
             let mut rest = points;
@@ -533,7 +557,7 @@ impl<S: Simd> Bvh<'_, S> {
         work: &mut Work<'_>,
         blocked: &mut [u64],
     ) {
-        let Work { batch, learned, packet, abreast, walls } = work;
+        let Work { batch, learned, packet, abreast, walls, beams } = work;
         let flat = match shaft {
             Some(shaft) if complete && rays_of(points) >= FEW * points.len() => {
                 Flat::new(targets, shaft, self.magnitude)
@@ -578,7 +602,14 @@ impl<S: Simd> Bvh<'_, S> {
             let (mut from, end) = (first as usize, first as usize + count as usize);
             while from < end {
                 let part = (end - from).min(MOST);
-                if part < FEW || (!complete && part < MIXED) {
+                if !complete && (SORTED..MIXED).contains(&part) && beams.wanted() {
+                    let every = u64::MAX >> (64 - part);
+                    let (batch, packet, learned) = (&mut **batch, &mut **packet, &mut **learned);
+                    self.sort(
+                        beams, x, from, every, targets, batch, packet, cut, given, ignore, counter, learned,
+                        blocked,
+                    );
+                } else if part < FEW || (!complete && part < MIXED) {
                     let mut i = from;
                     while i < from + part {
                         packet.put(x, targets.get(i), i);
@@ -593,6 +624,7 @@ impl<S: Simd> Bvh<'_, S> {
                                 *learned,
                                 blocked,
                             );
+                            beams.judge(&batch.stream, MOST as u32);
                         }
                         i += 1;
                     }
@@ -626,7 +658,13 @@ impl<S: Simd> Bvh<'_, S> {
                             learned.fail();
                         }
                     }
-                    if part <= SHARED {
+                    if beams.wanted() {
+                        let (batch, packet, learned) = (&mut **batch, &mut **packet, &mut **learned);
+                        self.sort(
+                            beams, x, from, ask, targets, batch, packet, cut, given, ignore, counter,
+                            learned, blocked,
+                        );
+                    } else if part <= SHARED {
                         while ask != 0 {
                             let i = from + ask.trailing_zeros() as usize;
                             ask &= ask - 1;
@@ -634,6 +672,7 @@ impl<S: Simd> Bvh<'_, S> {
                             if packet.count == MOST {
                                 let stream = &mut batch.stream;
                                 self.send(stream, packet, cut, given, ignore, counter, *learned, blocked);
+                                beams.judge(&batch.stream, MOST as u32);
                             }
                         }
                     } else if ask != 0 {
@@ -649,12 +688,19 @@ impl<S: Simd> Bvh<'_, S> {
                             counter,
                             *learned,
                         );
+                        beams.judge(&batch.stream, ask.count_ones());
                     }
                     set(blocked, from, word);
                 }
                 from += part;
             }
             k += 1;
+            if !beams.is_empty() && (k == points.len() || k.is_multiple_of(beams.group)) {
+                let stream = &mut batch.stream;
+                self.send_sorted(
+                    beams, stream, packet, targets, cut, given, ignore, counter, learned, blocked,
+                );
+            }
         }
         if packet.count > 0 {
             self.send(&mut batch.stream, packet, cut, given, ignore, counter, *learned, blocked);
@@ -742,6 +788,71 @@ impl<S: Simd> Bvh<'_, S> {
         set(blocked, first, word);
     }
 
+    /// Takes a point's rays among those to be sorted.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn sort(
+        &self,
+        beams: &mut Beams,
+        x: [f32; 3],
+        first: usize,
+        ask: u64,
+        targets: &Targets<'_>,
+        batch: &mut BatchScratch,
+        packet: &mut Packet,
+        cut: &Cut,
+        list: &List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        learned: &mut List,
+        blocked: &mut [u64],
+    ) {
+        if ask == 0 {
+            return;
+        }
+        self.simd.apart(
+            #[inline(always)]
+            || beams.put(self.simd, x, targets, first, ask),
+        );
+        if beams.is_full() {
+            let stream = &mut batch.stream;
+            self.send_sorted(beams, stream, packet, targets, cut, list, ignore, counter, learned, blocked);
+        }
+    }
+
+    /// The rays that were to be sorted, in their order.
+    #[allow(clippy::too_many_arguments)]
+    #[inline(always)]
+    fn send_sorted(
+        &self,
+        beams: &mut Beams,
+        stream: &mut Stream,
+        packet: &mut Packet,
+        targets: &Targets<'_>,
+        cut: &Cut,
+        list: &List,
+        ignore: Option<u32>,
+        counter: &mut impl Counter,
+        learned: &mut List,
+        blocked: &mut [u64],
+    ) {
+        self.simd.apart(
+            #[inline(always)]
+            || {
+                let count = beams.sort();
+                let mut k = 0;
+                while k < count {
+                    let (x, target) = beams.ray(k);
+                    packet.put(x, targets.get(target), target);
+                    k += 1;
+                    if packet.count == MOST || k == count {
+                        self.send(stream, packet, cut, list, ignore, counter, learned, blocked);
+                    }
+                }
+            },
+        );
+    }
+
     /// The rays that have been put together.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
@@ -789,6 +900,7 @@ impl<S: Simd> Bvh<'_, S> {
             self.join(stream, from, &rays, active);
             from += S::Packet::WIDTH;
         }
+        stream.surround(self.simd, self.magnitude);
         let start = Start { root: false, blocks: list.blocks(), nodes: cut.nodes(), entries: &[] };
         counter.rays(packet.count as u32);
         let ask = u64::MAX >> (64 - packet.count);

@@ -1,0 +1,345 @@
+//! Rays of neighbouring points, put together by where on the light they end.
+//!
+//! The rays of a point fan out over all of its light. Where much is in the way, few of them come to the same nodes, and
+//! none shares what a visit costs. Rays from all of a tile to one part of the light do stay together, if the light is
+//! the larger of the two. Sorting takes as long as a few steps down the tree, so rays are sorted where those of the
+//! tile's first point were seen to take many.
+
+use super::Targets;
+use super::batch::targets_from;
+use super::pyramid::MOST;
+use super::shaft::{Shaft, Turned};
+use super::stream::Stream;
+use crate::lanes::{Lanes, Simd};
+use crate::vec3x;
+use glam::Vec3;
+
+/// Rows of rays that are sorted together, at most.
+pub(super) const ROWS: usize = 64;
+
+/// Parts of the light along either side.
+const SIDE: usize = 8;
+const CELLS: usize = SIDE * SIDE;
+
+/// With so many visits in a hundred rays, or more, sorting pays, unless as many in a hundred rays come together.
+const DENSE: u32 = 12;
+const TOGETHER: u32 = 50;
+
+/// The verdict is of as many rays at least.
+const RAYS: u32 = 32;
+
+/// The cells along a Hilbert curve: those that follow each other are neighbours, and so most of 64 rays that do are in
+/// one cell or two, however many rays there are.
+const CURVE: [u8; CELLS] = curve();
+
+const fn curve() -> [u8; CELLS] {
+    let mut cells = [0; CELLS];
+    let mut k = 0;
+    while k < CELLS {
+        // From the finest square on, each turned as its place in the next larger one asks.
+        let (mut x, mut y, mut rest, mut side) = (0, 0, k, 1);
+        while side < SIDE {
+            let right = (rest / 2) & 1;
+            let up = (rest ^ right) & 1;
+            if up == 0 {
+                if right == 1 {
+                    (x, y) = (side - 1 - x, side - 1 - y);
+                }
+                (x, y) = (y, x);
+            }
+            (x, y) = (x + side * right, y + side * up);
+            rest /= 4;
+            side *= 2;
+        }
+        cells[k] = (y * SIDE + x) as u8;
+        k += 1;
+    }
+    cells
+}
+
+/// From a point to some of up to 64 targets.
+#[derive(Clone, Copy)]
+struct Row {
+    x: [f32; 3],
+    first: u32,
+    ask: u64,
+}
+
+/// Rays by row, and the cell of the light in which each ends.
+pub(super) struct Beams {
+    rows: [Row; ROWS],
+    count: usize,
+    /// The cells, as the last bits of numbers.
+    cells: [[f32; MOST]; ROWS],
+    /// Rays in each cell.
+    sizes: [u16; CELLS],
+    /// Rays in the order of their cells: 64 times the row, and the place in it.
+    order: [u16; ROWS * MOST],
+    middle: Vec3,
+    /// Cells for a step from the middle.
+    axes: [Vec3; 2],
+    /// Rows that are best sorted together; 0 where the tile is not much smaller than the light.
+    pub(super) group: usize,
+    verdict: Verdict,
+}
+
+/// Does sorting pay?
+#[derive(Clone, Copy, PartialEq)]
+enum Verdict {
+    /// Nothing was traced yet. In the tile before, it did or did not.
+    Open(bool),
+    Is(bool),
+}
+
+impl Beams {
+    pub(super) const NOTHING: Self = Self {
+        rows: [Row { x: [0.0; 3], first: 0, ask: 0 }; ROWS],
+        count: 0,
+        cells: [[0.0; MOST]; ROWS],
+        sizes: [0; CELLS],
+        order: [0; ROWS * MOST],
+        middle: Vec3::ZERO,
+        axes: [Vec3::ZERO; 2],
+        group: 0,
+        verdict: Verdict::Open(false),
+    };
+
+    /// For another tile, with so many targets a point.
+    #[inline(always)]
+    pub(super) fn aim(&mut self, shaft: &Shaft, each: usize) {
+        let (points, targets) = (&shaft.points, &shaft.targets);
+        self.middle = shaft.reference + targets.middle;
+        let mut k = 0;
+        while k < 2 {
+            let axis = targets.axes[k];
+            let size = axis.length_squared();
+            self.axes[k] = if size > 1e-30 { axis * (0.5 * SIDE as f32 / size) } else { Vec3::ZERO };
+            k += 1;
+        }
+        // 64 rays of so many rows are as wide where they begin as where they end, if the light is `wide` times as large
+        // as the tile, and has `each` targets a point: rows^2 = 64^2 wide^2 / each. As most that blocks is nearer to
+        // the points than to the light, fewer rows do better, by four.
+        let rows_squared = 256.0 * extent_squared(targets) / (extent_squared(points) * each as f32);
+        self.group = match rows_squared {
+            s if s >= 1024.0 => ROWS,
+            s if s >= 64.0 => 16,
+            s if s >= 16.0 => 4,
+            _ => 0,
+        };
+        if let Verdict::Is(pays) = self.verdict {
+            self.verdict = Verdict::Open(pays);
+        }
+    }
+
+    /// For a tile whose rays are not sorted.
+    #[inline(always)]
+    pub(super) fn skip(&mut self) {
+        self.group = 0;
+    }
+
+    /// Notes what it took to trace rays that were not sorted.
+    #[inline(always)]
+    pub(super) fn judge(&mut self, stream: &Stream, rays: u32) {
+        if matches!(self.verdict, Verdict::Open(_)) && rays >= RAYS {
+            let Stream { visits, comers, .. } = *stream;
+            let together = comers * 100 / rays >= TOGETHER * visits;
+            self.verdict = Verdict::Is(visits * 100 >= DENSE * rays && !together);
+        }
+    }
+
+    /// Are rays to be sorted?
+    #[inline(always)]
+    pub(super) fn wanted(&self) -> bool {
+        self.group > 0 && self.verdict == Verdict::Is(true)
+    }
+
+    /// Is the light so much larger than the tile that parts of the tile would see as much as all of it? Only where
+    /// sorting paid in the tile before.
+    #[inline(always)]
+    pub(super) fn instead_of_parts(&self) -> bool {
+        self.group == ROWS && self.verdict == Verdict::Open(true)
+    }
+
+    #[inline(always)]
+    pub(super) fn is_full(&self) -> bool {
+        self.count == ROWS
+    }
+
+    #[inline(always)]
+    pub(super) fn is_empty(&self) -> bool {
+        self.count == 0
+    }
+
+    /// Takes in the rays from a point to those of `ask` of the targets from the `first`th on. There must be room.
+    #[inline(always)]
+    pub(super) fn put<S: Simd>(
+        &mut self,
+        simd: S,
+        x: [f32; 3],
+        targets: &Targets<'_>,
+        first: usize,
+        ask: u64,
+    ) {
+        type P<S> = <S as Simd>::Packet;
+        let token = simd.token();
+        let one = |value: f32| P::<S>::splat(token, value);
+        let row = self.count & (ROWS - 1);
+        self.rows[row] = Row { x, first: first as u32, ask };
+        self.count += 1;
+        let cells = &mut self.cells[row];
+        let middle = vec3x::splat::<P<S>>(token, self.middle.to_array());
+        let s = vec3x::splat::<P<S>>(token, self.axes[0].to_array());
+        let t = vec3x::splat::<P<S>>(token, self.axes[1].to_array());
+        let (zero, most) = (one(0.0), one(SIDE as f32 - 1.0));
+        let (half, unit, side) = (one(0.5 * SIDE as f32 - 0.5), one(UNIT), one(SIDE as f32));
+        let count = MOST - ask.leading_zeros() as usize;
+        let mut i = 0;
+        while i < count {
+            let at = vec3x::sub(targets_from::<S>(token, targets, first + i, first + count), middle);
+            // Rounded to whole numbers by what they are added to.
+            let s = (vec3x::dot(at, s) + half).max(zero).min(most) + unit;
+            let t = (vec3x::dot(at, t) + half).max(zero).min(most) + unit;
+            ((t - unit) * side + s).store(&mut cells[i..]);
+            i += P::<S>::WIDTH;
+        }
+        let mut rest = ask;
+        while rest != 0 {
+            let i = rest.trailing_zeros() as usize;
+            rest &= rest - 1;
+            self.sizes[cell(cells[i])] += 1;
+        }
+    }
+
+    /// Sorts all rays by cell, and forgets them but for their order. Gives how many there are.
+    #[inline(always)]
+    pub(super) fn sort(&mut self) -> usize {
+        let mut next = [0; CELLS];
+        let (mut k, mut sum) = (0, 0);
+        while k < CELLS {
+            let cell = CURVE[k] as usize & (CELLS - 1);
+            next[cell] = sum;
+            sum += self.sizes[cell];
+            self.sizes[cell] = 0;
+            k += 1;
+        }
+        let mut row = 0;
+        while row < self.count.min(ROWS) {
+            let cells = &self.cells[row];
+            let mut rest = self.rows[row].ask;
+            while rest != 0 {
+                let i = rest.trailing_zeros() as usize;
+                rest &= rest - 1;
+                let next = &mut next[cell(cells[i])];
+                self.order[*next as usize & (ROWS * MOST - 1)] = (row * MOST + i) as u16;
+                *next += 1;
+            }
+            row += 1;
+        }
+        self.count = 0;
+        sum as usize
+    }
+
+    /// A ray by its place in the order: where it begins, and its target.
+    #[inline(always)]
+    pub(super) fn ray(&self, k: usize) -> ([f32; 3], usize) {
+        let at = self.order[k & (ROWS * MOST - 1)] as usize;
+        let row = &self.rows[(at / MOST) & (ROWS - 1)];
+        (row.x, row.first as usize + at % MOST)
+    }
+}
+
+/// From here to twice as much, the last bit of a number is worth one.
+const UNIT: f32 = 8_388_608.0;
+
+/// The cell that a number stands for; any, where it is not finite.
+#[inline(always)]
+fn cell(number: f32) -> usize {
+    number.to_bits() as usize & (CELLS - 1)
+}
+
+#[inline(always)]
+fn extent_squared(turned: &Turned) -> f32 {
+    let [a, b, c] = turned.axes;
+    (a.length_squared() + b.length_squared() + c.length_squared()).max(1e-30)
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+    use crate::lanes::{Native, Scalar};
+
+    #[test]
+    fn the_curve_goes_from_neighbour_to_neighbour_through_all_cells() {
+        let mut seen = [false; CELLS];
+        for &cell in &CURVE {
+            assert!(!seen[cell as usize]);
+            seen[cell as usize] = true;
+        }
+        let at = |cell: u8| [i32::from(cell) % SIDE as i32, i32::from(cell) / SIDE as i32];
+        for pair in CURVE.windows(2) {
+            let ([x, y], [u, v]) = (at(pair[0]), at(pair[1]));
+            assert_eq!((x - u).abs() + (y - v).abs(), 1);
+        }
+    }
+
+    /// Targets over a unit square, the last some that are nowhere.
+    fn targets() -> [[f32; 64]; 3] {
+        let mut at = [[0.0; 64]; 3];
+        let [x, y, _] = &mut at;
+        for (i, (x, y)) in x.iter_mut().zip(y).enumerate() {
+            (*x, *y) = ((i * 37 % 64) as f32 / 64.0 - 0.5, (i * 23 % 64) as f32 / 64.0 - 0.5);
+        }
+        (at[0][61], at[1][62], at[0][63]) = (f32::NAN, f32::INFINITY, -1e38);
+        at
+    }
+
+    fn sorted<S: Simd>(simd: S) -> [(u32, u32); 2 * 64 - 3] {
+        let [x, y, z] = targets();
+        let targets = Targets::new(&x, &y, &z).unwrap();
+        let mut beams = Beams { axes: [Vec3::X * 8.0, Vec3::Y * 8.0], ..Beams::NOTHING };
+        // Of each point two rows, and not all of the targets.
+        for row in 0..2 {
+            beams.put(simd, [row as f32, 0.0, 0.0], &targets, 0, (u64::from(u32::MAX) << 3) | (1 << 2));
+            beams.put(simd, [row as f32, 1.0, 0.0], &targets, 36, (1 << 28) - 1 - u64::from(row == 1));
+        }
+        let count = beams.sort();
+        assert!(beams.is_empty());
+        let mut rays = [(0, 0); 2 * 64 - 3];
+        let mut left = 0;
+        for k in 0..count {
+            let ([x, _, _], target) = beams.ray(k);
+            rays[left] = (x as u32, target as u32);
+            left += 1;
+        }
+        assert_eq!(left, 2 * (33 + 28) - 1);
+        rays
+    }
+
+    #[test]
+    fn every_ray_comes_once_and_cells_follow_each_other() {
+        let rays = sorted(Native);
+        let [x, y, _] = targets();
+        let place = |target: u32| {
+            let at = |v: f32| ((v * 8.0 + 3.5).clamp(0.0, 7.0) + UNIT) as usize % 8;
+            let cell = at(y[target as usize]) * 8 + at(x[target as usize]);
+            CURVE.iter().position(|&c| c as usize == cell)
+        };
+        let mut seen = [[0; 64]; 2];
+        let mut last = None;
+        for (row, target) in rays[..121].iter().copied() {
+            seen[row as usize][target as usize] += 1;
+            if target < 61 {
+                let next = place(target);
+                assert!(last <= next, "{last:?} {next:?}");
+                last = next;
+            }
+        }
+        for (row, seen) in seen.iter().enumerate() {
+            for (target, &times) in seen.iter().enumerate() {
+                let asked = (2..=34).contains(&target) || target >= 36 + row;
+                assert_eq!(times, u32::from(asked), "{row} {target}");
+            }
+        }
+        assert_eq!(sorted(Scalar), rays);
+    }
+}
