@@ -17,6 +17,10 @@ use occlude_kernel::{Bvh, Counts};
 use std::path::PathBuf;
 use std::time::Instant;
 
+/// As the command `occlude` has it. Embree has one of its own.
+#[global_allocator]
+static ALLOCATOR: mimalloc::MiMalloc = mimalloc::MiMalloc;
+
 /// Compares this library with its peers.
 #[derive(Parser)]
 struct Options {

@@ -69,7 +69,7 @@ impl Accel {
     /// Builds the tree of a scene's triangles; triangle `i` keeps the number `i`.
     pub fn build(scene: &Scene, quality: Quality) -> Self {
         let triangles: Vec<[Vec3; 3]> =
-            (0..scene.triangles.len() as u32).map(|i| scene.vertices(i)).collect();
+            (0..scene.triangles.len() as u32).into_par_iter().map(|i| scene.vertices(i)).collect();
         Self::from_triangles(&triangles, quality)
     }
 
@@ -79,12 +79,13 @@ impl Accel {
             return Self::default();
         }
         let boxes: Vec<Aabb> = triangles
-            .iter()
+            .par_iter()
             .map(|[a, b, c]| Aabb::new(a.min(*b).min(*c).into(), a.max(*b).max(*c).into()))
             .collect();
-        let Some(binary) = build_binary(&boxes, quality) else {
+        if crowded(&boxes) {
             return Self::evenly(triangles, &boxes);
-        };
+        }
+        let binary = build_binary(boxes, quality);
         let plans = plan(&binary);
         let (nodes, blocks) = cut(&Tree { binary: &binary, plans: &plans, triangles });
         Self { nodes, blocks, triangles: triangles.len() }
@@ -192,24 +193,23 @@ const LARGE: f32 = 2e5;
 /// matter most, since others find better places once those have theirs.
 const ROUNDS: [f32; 11] = [0.4, 0.2, 0.1, 0.6, 0.3, 0.2, 0.1, 1.0, 0.5, 0.3, 0.2];
 
-fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
+/// Is no tree worth looking for?
+fn crowded(boxes: &[Aabb]) -> bool {
     let whole = boxes.iter().fold(Aabb::empty(), |whole, b| whole.union(b));
     let areas: f64 = boxes.iter().map(|b| f64::from(b.half_area())).sum();
     let crowding = areas / f64::from(whole.half_area()) / boxes.len() as f64;
-    if boxes.len() > CROWDED.1 && crowding > CROWDED.0 {
-        return None;
-    }
+    boxes.len() > CROWDED.1 && crowding > CROWDED.0
+}
+
+fn build_binary(mut boxes: Vec<Aabb>, quality: Quality) -> Bvh2 {
     // PLOC merges boxes that are each other's best; where all are alike that is one pair a round, and building
     // takes the square of their number. So each grows by a little of its own; the tree's boxes are not these.
-    let boxes: Vec<Aabb> = boxes
-        .iter()
-        .zip(1u32..)
-        .map(|(b, number)| {
-            let grain = b.diagonal().max_element() * 1e-3 + b.min.abs().max(b.max.abs()).max_element() * 1e-6;
-            let more = grain * (number.wrapping_mul(0x9e37_79b9) >> 8) as f32 / (1 << 24) as f32;
-            Aabb::new(b.min - more, b.max + more)
-        })
-        .collect();
+    boxes.par_iter_mut().enumerate().for_each(|(index, b)| {
+        let grain = b.diagonal().max_element() * 1e-3 + b.min.abs().max(b.max.abs()).max_element() * 1e-6;
+        let number = index as u32 + 1;
+        let more = grain * (number.wrapping_mul(0x9e37_79b9) >> 8) as f32 / (1 << 24) as f32;
+        *b = Aabb::new(b.min - more, b.max + more);
+    });
     let (distance, depth, reinsertion) = match quality {
         Quality::Fast => (PlocSearchDistance::Low, 2, 0.01),
         Quality::Medium => {
@@ -229,7 +229,7 @@ fn build_binary(boxes: &[Aabb], quality: Quality) -> Option<Bvh2> {
         pairs.improve(reinsertion, &ROUNDS);
         binary.nodes = pairs.nodes(root);
     }
-    Some(binary)
+    binary
 }
 
 /// The cheapest way to stand for a subtree by at most `i + 1` children of a node, for `i` from 0 to 6.
@@ -285,7 +285,7 @@ impl Plan {
 /// Subtrees are planned at the same time.
 fn plan(binary: &Bvh2) -> Vec<Plan> {
     let nodes = &binary.nodes;
-    let mut plans = vec![Plan::default(); nodes.len()];
+    let mut plans: Vec<Plan> = nodes.par_iter().map(|_| Plan::default()).collect();
     // Subtrees that are small enough, and the pairs above them.
     let (mut small, mut above) = (Vec::new(), Vec::new());
     let mut waiting: Vec<_> = std::iter::once(1..nodes.len()).collect();

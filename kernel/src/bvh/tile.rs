@@ -37,7 +37,7 @@ pub struct TilePoint {
     pub count: u32,
 }
 
-/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About ninety kilobytes.
+/// What a tile works in: keep one a thread, so that nothing is cleared between queries. About eighty kilobytes.
 pub struct TileScratch {
     batch: BatchScratch,
     cut: Cut,
