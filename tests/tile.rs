@@ -182,6 +182,56 @@ fn tiles_answer_as_single_rays_do() {
     }
 }
 
+/// Much in the way of a light that is larger than the tile, and runs of points with many targets, with one and with none.
+#[test]
+fn rays_that_are_sorted_and_rays_that_are_not() {
+    let mut random = Random::new(23);
+    let triangles: Vec<Triangle> = (0..3000)
+        .map(|_| {
+            let a = Vec3::new(random.between(-1.0, 1.0), random.between(-1.0, 1.0), random.between(0.2, 1.8));
+            [a, a + random.direction() * 0.05, a + random.direction() * 0.05]
+        })
+        .collect();
+    let accel = Accel::from_triangles(&triangles, Quality::Fast);
+    let single = On { bvh: accel.bvh(), family: Family::Scalar };
+    let corner = Vec3::new(-0.6, -0.6, 2.0);
+    let (u, v) = (Vec3::X * 1.2, Vec3::Y * 1.2);
+    let mut scratch = TileScratch::new();
+    let mut total = [0, 0];
+    for trial in 0..40 {
+        let (mut points, mut ends) = (Vec::new(), Vec::new());
+        while points.len() < 100 {
+            let each =
+                [0, 1, 8, 16, 64, 70][if trial % 2 == 0 { random.below(6) } else { points.len() / 20 % 6 }];
+            for _ in 0..1 + random.below(40) {
+                let x = (Vec3::X * random.unit() + Vec3::Y * random.unit()) * 0.02;
+                points.push(TilePoint { x: x.to_array(), first: ends.len() as u32, count: each as u32 });
+                ends.extend((0..each).map(|_| corner + u * random.unit() + v * random.unit()));
+            }
+        }
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let mut want = vec![0u64; ends.len().div_ceil(64)];
+        for point in &points {
+            for i in point.first as usize..(point.first + point.count) as usize {
+                let hit = single.occluded(&Ray::segment(point.x, ends[i]), None, &mut Counts::default());
+                want[i / 64] |= u64::from(hit) << (i % 64);
+                total[usize::from(hit)] += 1;
+            }
+        }
+        for on in families(accel.bvh()) {
+            for targets in [any, any.on_parallelogram(corner, u, v)] {
+                let mut blocked = vec![0; want.len()];
+                let mut counts = Counts::default();
+                on.occluded_tile(&points, &targets, None, &mut counts, &mut scratch, &mut blocked);
+                assert_eq!(counts.rays, ends.len() as u64, "{}, trial {trial}", on.family);
+                assert_eq!(blocked, want, "{}, trial {trial}", on.family);
+            }
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
+}
+
 /// Walls along the axes that a light touches, which is turned to them: their planes are told from its corners by the last
 /// bits of either.
 #[test]

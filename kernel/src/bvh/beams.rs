@@ -22,8 +22,8 @@ const SIDE: usize = 8;
 const CELLS: usize = SIDE * SIDE;
 
 /// With so many visits in a hundred rays, or more, sorting pays, unless as many in a hundred rays come together.
-const DENSE: u32 = 12;
-const TOGETHER: u32 = 50;
+const DENSE: u64 = 12;
+const TOGETHER: u64 = 50;
 
 /// The verdict is of as many rays at least.
 const RAYS: u32 = 32;
@@ -141,8 +141,8 @@ impl Beams {
     #[inline(always)]
     pub(super) fn judge(&mut self, stream: &Stream, rays: u32) {
         if matches!(self.verdict, Verdict::Open(_)) && rays >= RAYS {
-            let Stream { visits, comers, .. } = *stream;
-            let together = comers * 100 / rays >= TOGETHER * visits;
+            let (Stream { visits, comers, .. }, rays) = (stream, u64::from(rays));
+            let together = comers * 100 >= TOGETHER * visits * rays;
             self.verdict = Verdict::Is(visits * 100 >= DENSE * rays && !together);
         }
     }

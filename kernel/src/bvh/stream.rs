@@ -34,8 +34,8 @@ pub(super) struct Stream {
     /// Around all rays, where that was asked for.
     hull: Option<Hull>,
     /// Nodes and blocks that the last rays came to, and how many of the rays came to each.
-    pub(super) visits: u32,
-    pub(super) comers: u32,
+    pub(super) visits: u64,
+    pub(super) comers: u64,
 }
 
 impl Stream {
@@ -295,7 +295,7 @@ impl<S: Simd> Bvh<'_, S> {
                 };
             }
             visits += 1;
-            comers += meet.count_ones();
+            comers += u64::from(meet.count_ones());
             if let Some(block) = block {
                 free &= !self.stream_at_block(stream, block, meet, part, counter, learner);
             } else if let Some(node) = node {

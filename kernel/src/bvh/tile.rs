@@ -695,12 +695,16 @@ impl<S: Simd> Bvh<'_, S> {
                 from += part;
             }
             k += 1;
-            if !beams.is_empty() && (k == points.len() || k.is_multiple_of(beams.group)) {
+            if !beams.is_empty() && k.is_multiple_of(beams.group) {
                 let stream = &mut batch.stream;
                 self.send_sorted(
                     beams, stream, packet, targets, cut, given, ignore, counter, learned, blocked,
                 );
             }
+        }
+        if !beams.is_empty() {
+            let stream = &mut batch.stream;
+            self.send_sorted(beams, stream, packet, targets, cut, given, ignore, counter, learned, blocked);
         }
         if packet.count > 0 {
             self.send(&mut batch.stream, packet, cut, given, ignore, counter, *learned, blocked);
