@@ -2,8 +2,8 @@
 //!
 //! The rays of a point fan out over all of its light. Where much is in the way, few of them come to the same nodes, and
 //! none shares what a visit costs. Rays from all of a tile to one part of the light do stay together, if the light is
-//! the larger of the two. Sorting takes as long as a few steps down the tree, so rays are sorted where those of the
-//! tile's first point were seen to take many.
+//! the larger of the two. Sorting takes as long as a few steps down the tree, so rays are sorted where the first of the
+//! tile were seen to take many.
 
 use super::Targets;
 use super::batch::targets_from;
@@ -21,15 +21,16 @@ pub(super) const ROWS: usize = 64;
 const SIDE: usize = 8;
 const CELLS: usize = SIDE * SIDE;
 
-/// With so many visits in a hundred rays, or more, sorting pays, unless as many in a hundred rays come together.
+/// Sorting pays from so many visits of nodes and blocks on, for a hundred rays, unless this part of the rays, in percent,
+/// comes together on average.
 const DENSE: u64 = 12;
 const TOGETHER: u64 = 50;
 
 /// The verdict is of as many rays at least.
 const RAYS: u32 = 32;
 
-/// The cells along a Hilbert curve: those that follow each other are neighbours, and so most of 64 rays that do are in
-/// one cell or two, however many rays there are.
+/// The cells along a Hilbert curve: those that follow each other are neighbours, and so 64 rays that do are in a compact
+/// part of the light, however many rays there are.
 const CURVE: [u8; CELLS] = curve();
 
 const fn curve() -> [u8; CELLS] {
@@ -107,18 +108,28 @@ impl Beams {
     /// For another tile, with so many targets a point.
     #[inline(always)]
     pub(super) fn aim(&mut self, shaft: &Shaft, each: usize) {
+        self.clear();
         let (points, targets) = (&shaft.points, &shaft.targets);
         self.middle = shaft.reference + targets.middle;
+        let [a, b, c] = targets.axes;
+        let [x, y, z] = [a.length_squared(), b.length_squared(), c.length_squared()];
+        let widest = if z <= x && z <= y {
+            [a, b]
+        } else if y <= x {
+            [a, c]
+        } else {
+            [b, c]
+        };
         let mut k = 0;
         while k < 2 {
-            let axis = targets.axes[k];
+            let axis = widest[k];
             let size = axis.length_squared();
             self.axes[k] = if size > 1e-30 { axis * (0.5 * SIDE as f32 / size) } else { Vec3::ZERO };
             k += 1;
         }
-        // 64 rays of so many rows are as wide where they begin as where they end, if the light is `wide` times as large
-        // as the tile, and has `each` targets a point: rows^2 = 64^2 wide^2 / each. As most that blocks is nearer to
-        // the points than to the light, fewer rows do better, by four.
+        // In a tile of 64 points, each with a row of `each` targets on a light that is `wide` times as long as the tile, 64
+        // rays of so many rows are as wide where they begin as where they end: rows^2 = 64^2 wide^2 / each. As most
+        // that blocks is nearer to the points than to the light, a quarter of them does better.
         let rows_squared = 256.0 * extent_squared(targets) / (extent_squared(points) * each as f32);
         self.group = match rows_squared {
             s if s >= 1024.0 => ROWS,
@@ -134,7 +145,15 @@ impl Beams {
     /// For a tile whose rays are not sorted.
     #[inline(always)]
     pub(super) fn skip(&mut self) {
+        self.clear();
         self.group = 0;
+    }
+
+    /// Forgets rays that a query left which did not come to its end.
+    #[inline(always)]
+    fn clear(&mut self) {
+        self.count = 0;
+        self.sizes = [0; CELLS];
     }
 
     /// Notes what it took to trace rays that were not sorted.
@@ -340,6 +359,8 @@ mod tests {
                 assert_eq!(times, u32::from(asked), "{row} {target}");
             }
         }
-        assert_eq!(sorted(Scalar), rays);
+        // Families may differ about the cells of targets that are no numbers.
+        let finite = |ray: &(u32, u32)| ray.1 < 61;
+        assert!(sorted(Scalar).into_iter().filter(finite).eq(rays.into_iter().filter(finite)));
     }
 }

@@ -20,13 +20,14 @@ pub(super) struct Hull {
     least: [[bool; 3]; 2],
 }
 
-/// How much wider it is than the segments, in roundings of the greatest coordinate: for boxes, as for those of a node
-/// ([`super::slabs`]), for the sums of origin and direction that the ends are, and for the bounds' own rounding.
+/// How much wider it is than the segments, in roundings of the greatest coordinate: for the triangle test, as boxes are
+/// ([`super::slabs`]), for the sums of origin and direction that the ends are, and for the bounds' own rounding; together
+/// about 30.
 const SLACK: f32 = 128.0 * ROUNDING;
 
 impl Hull {
-    /// Around segments that begin and end within these corners, which are no NaN. `magnitude` bounds every coordinate of the scene. `None`
-    /// where they are too far away.
+    /// Around segments that begin and end within these corners, which are no NaN. `magnitude` bounds every coordinate of
+    /// the scene. `None` where they are too far away.
     #[inline(always)]
     pub(super) fn new(begin: [Vec3; 2], end: [Vec3; 2], magnitude: f32) -> Option<Self> {
         let reach = begin[0].abs().max(begin[1].abs()).max(end[0].abs()).max(end[1].abs());

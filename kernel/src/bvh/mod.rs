@@ -16,8 +16,9 @@
 //!
 //! Every one gives the answer of a loop over all triangles with the test of [`crate::triangle`]: boxes are
 //! widened by a bound on all rounding, of the box test as of the triangle test, so no hit is culled. One thing is
-//! left to rounding: where a ray runs within a triangle's plane (to a millionth), `t` may be that of any point of
-//! the triangle, and a hit that rounding puts outside the box counts only if `t_min` and `t_max` let its box count.
+//! left to rounding: where a ray runs within a triangle's plane (to a thousandth), `t` may be that of any point of the
+//! triangle, and a hit that rounding puts outside its box counts only if `t_min` and `t_max` let that box, or one around
+//! it, count.
 
 mod abreast;
 mod batch;

@@ -404,15 +404,13 @@ impl<S: Simd> Bvh<'_, S> {
         let token = self.simd.token();
         let width = S::Packet::WIDTH;
         // Children that may be met at all.
-        let (mut near, mut tests) = (0xff, node.len());
+        let mut near = 0xff;
         if let Some(hull) = &stream.hull
             && meet.count_ones() > FEW_AT_NODE
         {
-            counter.node_tests(tests);
+            counter.node_tests(node.len());
             near = hull.children(self.simd, node);
-            tests = near.count_ones().min(tests);
         }
-        counter.node_tests(tests * meet.count_ones());
         // The rays of each child, and the children of any.
         let (mut meets, mut any) = ([0u64; 8], 0);
         let mut entry = [0.0; 8];
@@ -423,6 +421,7 @@ impl<S: Simd> Bvh<'_, S> {
             left &= !(u64::from(rays) << from);
             let mut these = 0;
             if rays.count_ones() <= FEW_AT_NODE {
+                counter.node_tests(node.len() * rays.count_ones());
                 // A byte a ray, and then a byte a child.
                 let mut rows = [0u64; 2];
                 let mut rest = rays;
@@ -445,6 +444,7 @@ impl<S: Simd> Bvh<'_, S> {
             } else {
                 let slabs = stream.packet_slabs::<S::Packet>(token, from);
                 let end = S::Packet::splat(token, 1.0);
+                counter.node_tests(near.count_ones().min(node.len()) * rays.count_ones());
                 let mut rest = near;
                 while rest != 0 {
                     let place = rest.trailing_zeros() as usize & 7;

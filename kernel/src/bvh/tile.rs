@@ -605,7 +605,7 @@ impl<S: Simd> Bvh<'_, S> {
                 if !complete && (SORTED..MIXED).contains(&part) && beams.wanted() {
                     let every = u64::MAX >> (64 - part);
                     let (batch, packet, learned) = (&mut **batch, &mut **packet, &mut **learned);
-                    self.sort(
+                    self.put_by(
                         beams, x, from, every, targets, batch, packet, cut, given, ignore, counter, learned,
                         blocked,
                     );
@@ -660,7 +660,7 @@ impl<S: Simd> Bvh<'_, S> {
                     }
                     if beams.wanted() {
                         let (batch, packet, learned) = (&mut **batch, &mut **packet, &mut **learned);
-                        self.sort(
+                        self.put_by(
                             beams, x, from, ask, targets, batch, packet, cut, given, ignore, counter,
                             learned, blocked,
                         );
@@ -792,10 +792,10 @@ impl<S: Simd> Bvh<'_, S> {
         set(blocked, first, word);
     }
 
-    /// Takes a point's rays among those to be sorted.
+    /// Puts a point's rays by, to be sorted.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
-    fn sort(
+    fn put_by(
         &self,
         beams: &mut Beams,
         x: [f32; 3],
