@@ -285,6 +285,7 @@ impl Plan {
 /// Subtrees are planned at the same time.
 fn plan(binary: &Bvh2) -> Vec<Plan> {
     let nodes = &binary.nodes;
+    // By all threads: what is written first the system has to clear.
     let mut plans: Vec<Plan> = nodes.par_iter().map(|_| Plan::default()).collect();
     // Subtrees that are small enough, and the pairs above them.
     let (mut small, mut above) = (Vec::new(), Vec::new());

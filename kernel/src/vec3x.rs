@@ -48,6 +48,15 @@ pub(crate) fn most<L: Lanes>(v: Vec3x<L>) -> L {
     v[0].max(v[1]).max(v[2])
 }
 
+/// The box around three positions in each lane: its least and its greatest corner.
+#[inline(always)]
+pub(crate) fn bounds<L: Lanes>([a, b, c]: [Vec3x<L>; 3]) -> [Vec3x<L>; 2] {
+    [
+        [a[0].min(b[0]).min(c[0]), a[1].min(b[1]).min(c[1]), a[2].min(b[2]).min(c[2])],
+        [a[0].max(b[0]).max(c[0]), a[1].max(b[1]).max(c[1]), a[2].max(b[2]).max(c[2])],
+    ]
+}
+
 /// The cross product, each product rounded.
 #[inline(always)]
 pub(crate) fn cross<L: Lanes>(a: Vec3x<L>, b: Vec3x<L>) -> Vec3x<L> {

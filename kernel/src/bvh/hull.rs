@@ -109,10 +109,7 @@ impl Hull {
             let a = vec3x::load::<N<S>, 8>(token, &block.vertices[0], from);
             let b = vec3x::load::<N<S>, 8>(token, &block.vertices[1], from);
             let c = vec3x::load::<N<S>, 8>(token, &block.vertices[2], from);
-            let bounds = [
-                [a[0].min(b[0]).min(c[0]), a[1].min(b[1]).min(c[1]), a[2].min(b[2]).min(c[2])],
-                [a[0].max(b[0]).max(c[0]), a[1].max(b[1]).max(c[1]), a[2].max(b[2]).max(c[2])],
-            ];
+            let bounds = vec3x::bounds([a, b, c]);
             met |= self.meets(token, bounds).bits() << from;
             from += N::<S>::WIDTH;
         }

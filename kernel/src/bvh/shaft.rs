@@ -414,9 +414,10 @@ impl Shaft {
             let c = vec3x::load::<N<S>, 8>(token, &block.vertices[2], from);
             let lower = vec3x::splat::<N<S>>(token, self.lower.to_array());
             let upper = vec3x::splat::<N<S>>(token, self.upper.to_array());
-            let mut inside = lower[0].le(a[0].max(b[0]).max(c[0])) & a[0].min(b[0]).min(c[0]).le(upper[0]);
-            inside = inside & lower[1].le(a[1].max(b[1]).max(c[1])) & a[1].min(b[1]).min(c[1]).le(upper[1]);
-            inside = inside & lower[2].le(a[2].max(b[2]).max(c[2])) & a[2].min(b[2]).min(c[2]).le(upper[2]);
+            let bounds = vec3x::bounds([a, b, c]);
+            let mut inside = lower[0].le(bounds[1][0]) & bounds[0][0].le(upper[0]);
+            inside = inside & lower[1].le(bounds[1][1]) & bounds[0][1].le(upper[1]);
+            inside = inside & lower[2].le(bounds[1][2]) & bounds[0][2].le(upper[2]);
             let mut k = 0;
             while k < PLANES && inside.any() {
                 let at = self.planes.at(token, k, a);

@@ -603,12 +603,7 @@ impl<S: Simd> Bvh<'_, S> {
             while from < end {
                 let part = (end - from).min(MOST);
                 if !complete && (SORTED..MIXED).contains(&part) && beams.wanted() {
-                    let every = u64::MAX >> (64 - part);
-                    let (batch, packet, learned) = (&mut **batch, &mut **packet, &mut **learned);
-                    self.put_by(
-                        beams, x, from, every, targets, batch, packet, cut, given, ignore, counter, learned,
-                        blocked,
-                    );
+                    self.put_by(beams, x, targets, from, u64::MAX >> (64 - part));
                 } else if part < FEW || (!complete && part < MIXED) {
                     let mut i = from;
                     while i < from + part {
@@ -659,11 +654,7 @@ impl<S: Simd> Bvh<'_, S> {
                         }
                     }
                     if beams.wanted() {
-                        let (batch, packet, learned) = (&mut **batch, &mut **packet, &mut **learned);
-                        self.put_by(
-                            beams, x, from, ask, targets, batch, packet, cut, given, ignore, counter,
-                            learned, blocked,
-                        );
+                        self.put_by(beams, x, targets, from, ask);
                     } else if part <= SHARED {
                         while ask != 0 {
                             let i = from + ask.trailing_zeros() as usize;
@@ -693,14 +684,15 @@ impl<S: Simd> Bvh<'_, S> {
                     set(blocked, from, word);
                 }
                 from += part;
+                let grouped = from == end && (k + 1).is_multiple_of(beams.group);
+                if beams.is_full() || (grouped && !beams.is_empty()) {
+                    let stream = &mut batch.stream;
+                    self.send_sorted(
+                        beams, stream, packet, targets, cut, given, ignore, counter, learned, blocked,
+                    );
+                }
             }
             k += 1;
-            if !beams.is_empty() && k.is_multiple_of(beams.group) {
-                let stream = &mut batch.stream;
-                self.send_sorted(
-                    beams, stream, packet, targets, cut, given, ignore, counter, learned, blocked,
-                );
-            }
         }
         if !beams.is_empty() {
             let stream = &mut batch.stream;
@@ -792,35 +784,14 @@ impl<S: Simd> Bvh<'_, S> {
         set(blocked, first, word);
     }
 
-    /// Puts a point's rays by, to be sorted.
-    #[allow(clippy::too_many_arguments)]
+    /// Puts a point's rays by, to be sorted. There must be room.
     #[inline(always)]
-    fn put_by(
-        &self,
-        beams: &mut Beams,
-        x: [f32; 3],
-        first: usize,
-        ask: u64,
-        targets: &Targets<'_>,
-        batch: &mut BatchScratch,
-        packet: &mut Packet,
-        cut: &Cut,
-        list: &List,
-        ignore: Option<u32>,
-        counter: &mut impl Counter,
-        learned: &mut List,
-        blocked: &mut [u64],
-    ) {
-        if ask == 0 {
-            return;
-        }
-        self.simd.apart(
-            #[inline(always)]
-            || beams.put(self.simd, x, targets, first, ask),
-        );
-        if beams.is_full() {
-            let stream = &mut batch.stream;
-            self.send_sorted(beams, stream, packet, targets, cut, list, ignore, counter, learned, blocked);
+    fn put_by(&self, beams: &mut Beams, x: [f32; 3], targets: &Targets<'_>, first: usize, ask: u64) {
+        if ask != 0 {
+            self.simd.apart(
+                #[inline(always)]
+                || beams.put(self.simd, x, targets, first, ask),
+            );
         }
     }
 
