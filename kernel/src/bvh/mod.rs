@@ -25,6 +25,7 @@ mod batch;
 mod beams;
 mod cover;
 mod hull;
+mod list;
 mod occluders;
 mod packet;
 mod part;
