@@ -6,20 +6,14 @@
 //! tile were seen to take many.
 
 use super::Targets;
-use super::batch::targets_from;
+use super::grid::{CELLS, Grid, SIDE, cell};
 use super::pyramid::MOST;
 use super::shaft::{Shaft, Turned};
 use super::stream::Stream;
-use crate::lanes::{Lanes, Simd};
-use crate::vec3x;
-use glam::Vec3;
+use crate::lanes::Simd;
 
 /// Rows of rays that are sorted together, at most.
 pub(super) const ROWS: usize = 64;
-
-/// Parts of the light along either side.
-const SIDE: usize = 8;
-const CELLS: usize = SIDE * SIDE;
 
 /// Sorting pays from so many visits of nodes and blocks on, for a hundred rays, unless this part of the rays, in percent,
 /// comes together on average.
@@ -76,9 +70,7 @@ pub(super) struct Beams {
     sizes: [u16; CELLS],
     /// Rays in the order of their cells: 64 times the row, and the place in it.
     order: [u16; ROWS * MOST],
-    middle: Vec3,
-    /// Cells for a step from the middle.
-    axes: [Vec3; 2],
+    grid: Grid,
     /// Rows that are best sorted together; 0 where the tile is not much smaller than the light.
     pub(super) group: usize,
     verdict: Verdict,
@@ -99,8 +91,7 @@ impl Beams {
         cells: [[0.0; MOST]; ROWS],
         sizes: [0; CELLS],
         order: [0; ROWS * MOST],
-        middle: Vec3::ZERO,
-        axes: [Vec3::ZERO; 2],
+        grid: Grid::NOTHING,
         group: 0,
         verdict: Verdict::Open(false),
     };
@@ -110,23 +101,7 @@ impl Beams {
     pub(super) fn aim(&mut self, shaft: &Shaft, each: usize) {
         self.clear();
         let (points, targets) = (&shaft.points, &shaft.targets);
-        self.middle = shaft.reference + targets.middle;
-        let [a, b, c] = targets.axes;
-        let [x, y, z] = [a.length_squared(), b.length_squared(), c.length_squared()];
-        let widest = if z <= x && z <= y {
-            [a, b]
-        } else if y <= x {
-            [a, c]
-        } else {
-            [b, c]
-        };
-        let mut k = 0;
-        while k < 2 {
-            let axis = widest[k];
-            let size = axis.length_squared();
-            self.axes[k] = if size > 1e-30 { axis * (0.5 * SIDE as f32 / size) } else { Vec3::ZERO };
-            k += 1;
-        }
+        self.grid = Grid::new(shaft);
         // In a tile of 64 points, each with a row of `each` targets on a light that is `wide` times as long as the tile, 64
         // rays of so many rows are as wide where they begin as where they end: rows^2 = 64^2 wide^2 / each. As most
         // that blocks is nearer to the points than to the light, a quarter of them does better.
@@ -199,28 +174,11 @@ impl Beams {
         first: usize,
         ask: u64,
     ) {
-        type P<S> = <S as Simd>::Packet;
-        let token = simd.token();
-        let one = |value: f32| P::<S>::splat(token, value);
         let row = self.count & (ROWS - 1);
         self.rows[row] = Row { x, first: first as u32, ask };
         self.count += 1;
         let cells = &mut self.cells[row];
-        let middle = vec3x::splat::<P<S>>(token, self.middle.to_array());
-        let s = vec3x::splat::<P<S>>(token, self.axes[0].to_array());
-        let t = vec3x::splat::<P<S>>(token, self.axes[1].to_array());
-        let (zero, most) = (one(0.0), one(SIDE as f32 - 1.0));
-        let (half, unit, side) = (one(0.5 * SIDE as f32 - 0.5), one(UNIT), one(SIDE as f32));
-        let count = MOST - ask.leading_zeros() as usize;
-        let mut i = 0;
-        while i < count {
-            let at = vec3x::sub(targets_from::<S>(token, targets, first + i, first + count), middle);
-            // Rounded to whole numbers by what they are added to.
-            let s = (vec3x::dot(at, s) + half).max(zero).min(most) + unit;
-            let t = (vec3x::dot(at, t) + half).max(zero).min(most) + unit;
-            ((t - unit) * side + s).store(&mut cells[i..]);
-            i += P::<S>::WIDTH;
-        }
+        self.grid.find(simd, targets, first, MOST - ask.leading_zeros() as usize, cells);
         let mut rest = ask;
         while rest != 0 {
             let i = rest.trailing_zeros() as usize;
@@ -267,15 +225,6 @@ impl Beams {
     }
 }
 
-/// From here to twice as much, the last bit of a number is worth one.
-const UNIT: f32 = 8_388_608.0;
-
-/// The cell that a number stands for; any, where it is not finite.
-#[inline(always)]
-fn cell(number: f32) -> usize {
-    number.to_bits() as usize & (CELLS - 1)
-}
-
 #[inline(always)]
 fn extent_squared(turned: &Turned) -> f32 {
     let [a, b, c] = turned.axes;
@@ -285,7 +234,9 @@ fn extent_squared(turned: &Turned) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
+    use crate::bvh::grid::UNIT;
     use crate::lanes::{Native, Scalar};
+    use glam::Vec3;
 
     #[test]
     fn the_curve_goes_from_neighbour_to_neighbour_through_all_cells() {
@@ -315,7 +266,8 @@ mod tests {
     fn sorted<S: Simd>(simd: S) -> [(u32, u32); 2 * 64 - 3] {
         let [x, y, z] = targets();
         let targets = Targets::new(&x, &y, &z).unwrap();
-        let mut beams = Beams { axes: [Vec3::X * 8.0, Vec3::Y * 8.0], ..Beams::NOTHING };
+        let grid = Grid { middle: Vec3::ZERO, axes: [Vec3::X * 8.0, Vec3::Y * 8.0] };
+        let mut beams = Beams { grid, ..Beams::NOTHING };
         // Of each point two rows, and not all of the targets.
         for row in 0..2 {
             beams.put(simd, [row as f32, 0.0, 0.0], &targets, 0, (u64::from(u32::MAX) << 3) | (1 << 2));

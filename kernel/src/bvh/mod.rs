@@ -24,6 +24,7 @@ mod abreast;
 mod batch;
 mod beams;
 mod cover;
+mod grid;
 mod hull;
 mod list;
 mod occluders;

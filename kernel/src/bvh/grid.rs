@@ -1,0 +1,85 @@
+//! The parts of a light: eight by eight cells of the box around a tile's targets, along its two longest sides.
+
+use super::Targets;
+use super::batch::targets_from;
+use super::pyramid::MOST;
+use super::shaft::Shaft;
+use crate::lanes::{Lanes, Simd};
+use crate::vec3x;
+use glam::Vec3;
+
+/// Parts of the light along either side.
+pub(super) const SIDE: usize = 8;
+pub(super) const CELLS: usize = SIDE * SIDE;
+
+/// Cells, numbered row by row.
+pub(super) struct Grid {
+    pub(super) middle: Vec3,
+    /// Cells for a step from the middle.
+    pub(super) axes: [Vec3; 2],
+}
+
+impl Grid {
+    pub(super) const NOTHING: Self = Self { middle: Vec3::ZERO, axes: [Vec3::ZERO; 2] };
+
+    /// Over the targets of a shaft.
+    #[inline(always)]
+    pub(super) fn new(shaft: &Shaft) -> Self {
+        let targets = &shaft.targets;
+        let [a, b, c] = targets.axes;
+        let [x, y, z] = [a.length_squared(), b.length_squared(), c.length_squared()];
+        let longest = if z <= x && z <= y {
+            [a, b]
+        } else if y <= x {
+            [a, c]
+        } else {
+            [b, c]
+        };
+        let mut axes = [Vec3::ZERO; 2];
+        let mut k = 0;
+        while k < 2 {
+            let size = longest[k].length_squared();
+            axes[k] = if size > 1e-30 { longest[k] * (0.5 * SIDE as f32 / size) } else { Vec3::ZERO };
+            k += 1;
+        }
+        Self { middle: shaft.reference + targets.middle, axes }
+    }
+
+    /// Finds the cells of targets, as the last bits of numbers.
+    #[inline(always)]
+    pub(super) fn find<S: Simd>(
+        &self,
+        simd: S,
+        targets: &Targets<'_>,
+        first: usize,
+        count: usize,
+        cells: &mut [f32; MOST],
+    ) {
+        type P<S> = <S as Simd>::Packet;
+        let token = simd.token();
+        let one = |value: f32| P::<S>::splat(token, value);
+        let middle = vec3x::splat::<P<S>>(token, self.middle.to_array());
+        let s = vec3x::splat::<P<S>>(token, self.axes[0].to_array());
+        let t = vec3x::splat::<P<S>>(token, self.axes[1].to_array());
+        let (zero, most) = (one(0.0), one(SIDE as f32 - 1.0));
+        let (half, unit, side) = (one(0.5 * SIDE as f32 - 0.5), one(UNIT), one(SIDE as f32));
+        let mut i = 0;
+        while i < count {
+            let at = vec3x::sub(targets_from::<S>(token, targets, first + i, first + count), middle);
+            // Rounded to whole numbers by what they are added to.
+            let s = (vec3x::dot(at, s) + half).max(zero).min(most) + unit;
+            let t = (vec3x::dot(at, t) + half).max(zero).min(most) + unit;
+            ((t - unit) * side + s).store(&mut cells[i..]);
+            i += P::<S>::WIDTH;
+        }
+    }
+}
+
+/// From here to twice as much, the last bit of a number is worth one.
+pub(super) const UNIT: f32 = 8_388_608.0;
+
+/// The cell that a number stands for; any, where it is not finite.
+#[inline(always)]
+pub(super) fn cell(number: f32) -> usize {
+    number.to_bits() as usize & (CELLS - 1)
+}
