@@ -234,6 +234,66 @@ fn rays_that_are_sorted_and_rays_that_are_not() {
 
 /// Walls along the axes that a light touches, which is turned to them: their planes are told from its corners by the last
 /// bits of either.
+/// A ceiling with holes under a large light, amid confetti: too much for a list, and no sheet hides all.
+#[test]
+fn parts_of_a_large_light_behind_a_ceiling() {
+    let mut random = Random::new(31);
+    let corner = Vec3::new(-1.0, -1.0, 2.0);
+    let (u, v) = (Vec3::X * 2.0, Vec3::Y * 2.0);
+    let mut scratch = TileScratch::new();
+    let (mut total, mut nodes) = ([0, 0], [0, 0]);
+    for trial in 0..24 {
+        let mut triangles: Vec<Triangle> = (0..200)
+            .map(|_| {
+                let at = [random.between(-1.0, 1.0), random.between(-1.0, 1.0), random.between(0.2, 1.8)];
+                [Vec3::from(at); 3].map(|corner| corner + random.direction() * 0.02)
+            })
+            .collect();
+        let height = random.between(0.4, 1.6);
+        let dent = if trial % 3 == 0 { 0.0 } else { 0.1 };
+        let grid: Vec<Vec3> = (0..25)
+            .map(|k| Vec3::new((k % 5) as f32 * 0.5 - 1.0, (k / 5) as f32 * 0.5 - 1.0, height))
+            .map(|at| at + Vec3::Z * random.between(-dent, dent))
+            .collect();
+        for k in (0..19).filter(|k| k % 5 < 4 && random.unit() < 0.7) {
+            let [a, b, c, d] = [grid[k], grid[k + 1], grid[k + 6], grid[k + 5]];
+            triangles.extend([[a, b, c], [a, c, d]]);
+        }
+        let accel = Accel::from_triangles(&triangles, Quality::High);
+        let single = On { bvh: accel.bvh(), family: Family::Scalar };
+        let each = [32, 64, 100][trial % 3];
+        let points: Vec<TilePoint> = (0..64)
+            .map(|k| {
+                let at = Vec3::new((k % 8) as f32, (k / 8) as f32, 0.0) * [0.001, 0.01][trial % 2];
+                TilePoint { x: at.to_array(), first: k * each, count: each }
+            })
+            .collect();
+        let ends: Vec<Vec3> =
+            (0..64 * each).map(|_| corner + u * random.unit() + v * random.unit()).collect();
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let targets = Targets::new(&xs, &ys, &zs).expect("of one length").on_parallelogram(corner, u, v);
+        let mut want = vec![0u64; ends.len() / 64];
+        for (i, &end) in ends.iter().enumerate() {
+            let ray = Ray::segment(points[i / each as usize].x, end);
+            let hit = single.occluded(&ray, None, &mut Counts::default());
+            want[i / 64] |= u64::from(hit) << (i % 64);
+            total[usize::from(hit)] += 1;
+        }
+        for on in families(accel.bvh()) {
+            // With a triangle to ignore, be there none of the number, rays are traced to all parts of the light.
+            for (way, ignore) in [None, Some(u32::MAX - 1)].into_iter().enumerate() {
+                let (mut blocked, mut counts) = (vec![0; want.len()], Counts::default());
+                on.occluded_tile(&points, &targets, ignore, &mut counts, &mut scratch, &mut blocked);
+                assert_eq!(blocked, want, "{}, trial {trial}", on.family);
+                assert_eq!(counts.rays, ends.len() as u64, "{}, trial {trial}", on.family);
+                nodes[way] += counts.node_tests;
+            }
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 20_000), "{total:?}");
+    assert!(nodes[0] * 10 < nodes[1] * 8, "{nodes:?}");
+}
+
 #[test]
 fn walls_at_the_corner_of_a_light() {
     let mut random = Random::new(23);

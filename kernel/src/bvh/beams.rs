@@ -20,8 +20,10 @@ pub(super) const ROWS: usize = 64;
 const DENSE: u64 = 12;
 const TOGETHER: u64 = 50;
 
-/// The verdict is of as many rays at least.
+/// The verdict is of as many rays at least, and of fewer where parts of the light are hidden: the other rays of the same
+/// point go elsewhere.
 const RAYS: u32 = 32;
+const FEW_RAYS: u32 = 6;
 
 /// The cells along a Hilbert curve: those that follow each other are neighbours, and so 64 rays that do are in a compact
 /// part of the light, however many rays there are.
@@ -70,7 +72,9 @@ pub(super) struct Beams {
     sizes: [u16; CELLS],
     /// Rays in the order of their cells: 64 times the row, and the place in it.
     order: [u16; ROWS * MOST],
-    grid: Grid,
+    pub(super) grid: Grid,
+    /// Cells of the light that are known to be hidden from all of the tile.
+    pub(super) hidden: u64,
     /// Rows that are best sorted together; 0 where the tile is not much smaller than the light.
     pub(super) group: usize,
     verdict: Verdict,
@@ -92,6 +96,7 @@ impl Beams {
         sizes: [0; CELLS],
         order: [0; ROWS * MOST],
         grid: Grid::NOTHING,
+        hidden: 0,
         group: 0,
         verdict: Verdict::Open(false),
     };
@@ -102,6 +107,7 @@ impl Beams {
         self.clear();
         let (points, targets) = (&shaft.points, &shaft.targets);
         self.grid = Grid::new(shaft);
+        self.hidden = 0;
         // In a tile of 64 points, each with a row of `each` targets on a light that is `wide` times as long as the tile, 64
         // rays of so many rows are as wide where they begin as where they end: rows^2 = 64^2 wide^2 / each. As most
         // that blocks is nearer to the points than to the light, a quarter of them does better.
@@ -121,7 +127,7 @@ impl Beams {
     #[inline(always)]
     pub(super) fn skip(&mut self) {
         self.clear();
-        self.group = 0;
+        (self.group, self.hidden) = (0, 0);
     }
 
     /// Forgets rays that a query left which did not come to its end.
@@ -134,7 +140,8 @@ impl Beams {
     /// Notes what it took to trace rays that were not sorted.
     #[inline(always)]
     pub(super) fn judge(&mut self, stream: &Stream, rays: u32) {
-        if matches!(self.verdict, Verdict::Open(_)) && rays >= RAYS {
+        let enough = if self.hidden == 0 { RAYS } else { FEW_RAYS };
+        if matches!(self.verdict, Verdict::Open(_)) && rays >= enough {
             let (Stream { visits, comers, .. }, rays) = (stream, u64::from(rays));
             let together = comers * 100 >= TOGETHER * visits * rays;
             self.verdict = Verdict::Is(visits * 100 >= DENSE * rays && !together);
@@ -147,11 +154,11 @@ impl Beams {
         self.group > 0 && self.verdict == Verdict::Is(true)
     }
 
-    /// Is the light so much larger than the tile that parts of the tile would see as much as all of it? Only where
-    /// sorting paid in the tile before.
+    /// Would parts of the tile see as much as all of it? So it is where parts of the light are hidden from all, and where
+    /// the light is so much larger than the tile that sorting paid in the tile before.
     #[inline(always)]
     pub(super) fn instead_of_parts(&self) -> bool {
-        self.group == ROWS && self.verdict == Verdict::Open(true)
+        self.hidden != 0 || (self.group == ROWS && self.verdict == Verdict::Open(true))
     }
 
     #[inline(always)]
@@ -162,6 +169,27 @@ impl Beams {
     #[inline(always)]
     pub(super) fn is_empty(&self) -> bool {
         self.count == 0
+    }
+
+    /// Which of up to 64 targets from the `first`th on lie in cells that are known to be hidden?
+    #[inline(always)]
+    pub(super) fn hides<S: Simd>(
+        &mut self,
+        simd: S,
+        targets: &Targets<'_>,
+        first: usize,
+        count: usize,
+    ) -> u64 {
+        // The row that is next put by has no other use yet.
+        let cells = &mut self.cells[self.count & (ROWS - 1)];
+        self.grid.find(simd, targets, first, count, cells);
+        let mut word = 0;
+        let mut i = 0;
+        while i < MOST {
+            word |= (self.hidden >> cell(cells[i]) & 1) << i;
+            i += 1;
+        }
+        word & (u64::MAX >> (MOST - count))
     }
 
     /// Takes in the rays from a point to those of `ask` of the targets from the `first`th on. There must be room.
@@ -266,7 +294,7 @@ mod tests {
     fn sorted<S: Simd>(simd: S) -> [(u32, u32); 2 * 64 - 3] {
         let [x, y, z] = targets();
         let targets = Targets::new(&x, &y, &z).unwrap();
-        let grid = Grid { middle: Vec3::ZERO, axes: [Vec3::X * 8.0, Vec3::Y * 8.0] };
+        let grid = Grid { middle: Vec3::ZERO, axes: [Vec3::X * 8.0, Vec3::Y * 8.0], ..Grid::NOTHING };
         let mut beams = Beams { grid, ..Beams::NOTHING };
         // Of each point two rows, and not all of the targets.
         for row in 0..2 {

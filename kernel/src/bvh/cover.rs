@@ -104,7 +104,7 @@ fn vertex(block: &TriangleBlock, lane: usize, k: usize, reference: Vec3) -> Vec3
 
 /// The vertices of a block's lane, from the reference.
 #[inline(always)]
-fn triangle(block: &TriangleBlock, lane: usize, reference: Vec3) -> [Vec3; 3] {
+pub(super) fn triangle(block: &TriangleBlock, lane: usize, reference: Vec3) -> [Vec3; 3] {
     [vertex(block, lane, 0, reference), vertex(block, lane, 1, reference), vertex(block, lane, 2, reference)]
 }
 
@@ -224,8 +224,9 @@ fn across(block: &TriangleBlock, lane: usize, k: usize, grown: u32) -> Option<(u
     None
 }
 
+/// A vertex of a block's lane.
 #[inline(always)]
-fn at(block: &TriangleBlock, lane: usize, k: usize) -> [f32; 3] {
+pub(super) fn at(block: &TriangleBlock, lane: usize, k: usize) -> [f32; 3] {
     let [x, y, z] = &block.vertices[k];
     [x[lane], y[lane], z[lane]]
 }

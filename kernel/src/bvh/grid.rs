@@ -12,15 +12,32 @@ use glam::Vec3;
 pub(super) const SIDE: usize = 8;
 pub(super) const CELLS: usize = SIDE * SIDE;
 
+/// Where the middles of the cells are, in halves of the sides from the middle of all.
+pub(super) const MIDDLES: [[f32; CELLS]; 2] = middles();
+
+const fn middles() -> [[f32; CELLS]; 2] {
+    let mut middles = [[0.0; CELLS]; 2];
+    let mut k = 0;
+    while k < CELLS {
+        middles[0][k] = (2 * (k % SIDE) + 1) as f32 / SIDE as f32 - 1.0;
+        middles[1][k] = (2 * (k / SIDE) + 1) as f32 / SIDE as f32 - 1.0;
+        k += 1;
+    }
+    middles
+}
+
 /// Cells, numbered row by row.
 pub(super) struct Grid {
     pub(super) middle: Vec3,
+    /// Half the box's sides, the longest two first.
+    pub(super) halves: [Vec3; 3],
     /// Cells for a step from the middle.
     pub(super) axes: [Vec3; 2],
 }
 
 impl Grid {
-    pub(super) const NOTHING: Self = Self { middle: Vec3::ZERO, axes: [Vec3::ZERO; 2] };
+    pub(super) const NOTHING: Self =
+        Self { middle: Vec3::ZERO, halves: [Vec3::ZERO; 3], axes: [Vec3::ZERO; 2] };
 
     /// Over the targets of a shaft.
     #[inline(always)]
@@ -28,21 +45,21 @@ impl Grid {
         let targets = &shaft.targets;
         let [a, b, c] = targets.axes;
         let [x, y, z] = [a.length_squared(), b.length_squared(), c.length_squared()];
-        let longest = if z <= x && z <= y {
-            [a, b]
+        let halves = if z <= x && z <= y {
+            [a, b, c]
         } else if y <= x {
-            [a, c]
+            [a, c, b]
         } else {
-            [b, c]
+            [b, c, a]
         };
         let mut axes = [Vec3::ZERO; 2];
         let mut k = 0;
         while k < 2 {
-            let size = longest[k].length_squared();
-            axes[k] = if size > 1e-30 { longest[k] * (0.5 * SIDE as f32 / size) } else { Vec3::ZERO };
+            let size = halves[k].length_squared();
+            axes[k] = if size > 1e-30 { halves[k] * (0.5 * SIDE as f32 / size) } else { Vec3::ZERO };
             k += 1;
         }
-        Self { middle: shaft.reference + targets.middle, axes }
+        Self { middle: shaft.reference + targets.middle, halves, axes }
     }
 
     /// Finds the cells of targets, as the last bits of numbers.

@@ -37,6 +37,7 @@ mod slabs;
 mod small;
 mod stream;
 mod tile;
+mod umbra;
 
 pub use batch::{BatchScratch, Targets};
 pub use occluders::Occluders;

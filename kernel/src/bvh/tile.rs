@@ -3,8 +3,9 @@
 //! A shaft around the points and the targets goes down the tree first. Often it comes back empty, and every target
 //! is visible; or a sheet of triangles stands across it ([`super::cover`]), and none is. Else it yields the few triangles
 //! there are, side by side in blocks of their own, or, where they are many, the subtrees to begin with. With many samples
-//! a point, long lists and subtrees are cut down by narrower shafts for parts of the points; with few, long lists of which
-//! most matter make room for the subtrees. Then the points are asked: abreast against a list
+//! a point it is then asked which parts of the light lie behind sheets of the first triangles that the shaft came to
+//! ([`super::umbra`]), and long lists and subtrees are cut down by narrower shafts for parts of the points; with few, long
+//! lists of which most matter make room for the subtrees. Then the points are asked: abreast against a list
 //! ([`super::abreast`]), or from the subtrees on, up to 64 rays together ([`super::stream`]), where the triangles that
 //! blocked anything for one point are asked first for the next. What these leave open goes together with the same point's
 //! rays, or, where much is in the way of a large light, with other points' to the same part of it ([`super::beams`]).
@@ -19,6 +20,7 @@ use super::pyramid::{Forgetful, Going, Learner, MOST};
 use super::shaft::{Around, Shaft, Turned};
 use super::single::Place;
 use super::stream::{Start, Stream};
+use super::umbra::Umbra;
 use super::{ALL_LANES, Bvh, CUT, Child, Node, Occluders, Targets};
 use crate::counter::Counter;
 use crate::lanes::{Lanes, Simd};
@@ -53,6 +55,7 @@ pub struct TileScratch {
     /// For how many tiles with long lists to come these are not asked.
     thick: u32,
     beams: Beams,
+    umbra: Umbra,
 }
 
 impl TileScratch {
@@ -70,6 +73,7 @@ impl TileScratch {
             sheet: None,
             thick: 0,
             beams: Beams::NOTHING,
+            umbra: Umbra::NOTHING,
         }
     }
 }
@@ -312,6 +316,7 @@ impl<S: Simd> Bvh<'_, S> {
             sheet,
             thick,
             beams,
+            umbra,
         } = scratch;
         (given.count, learned.count, learned.credit) = (0, 0, CREDIT);
         let complete = match &shaft {
@@ -337,9 +342,26 @@ impl<S: Simd> Bvh<'_, S> {
             Some(shaft) if rays >= SORTED * points.len() => beams.aim(shaft, rays / points.len()),
             _ => beams.skip(),
         }
+        let fine = rays >= FINE * points.len();
+        if !complete {
+            if let Some(shaft) = &shaft
+                && fine
+                && beams.group > 0
+                && ignore.is_none()
+            {
+                beams.hidden =
+                    umbra.hidden_cells(self.simd, shaft, &beams.grid, given, self.magnitude, counter);
+                if beams.hidden == u64::MAX {
+                    counter.rays(rays as u32);
+                    fill_all(blocked, points);
+                    return;
+                }
+            }
+            // A list that is not all there is would be asked for nothing as often as not.
+            given.count = 0;
+        }
         let parts = complete || !beams.instead_of_parts();
         let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls, beams };
-        let fine = rays >= FINE * points.len();
         let apart = fine && parts && points.len() > PART && !(complete && given.count <= SHORT);
         let Some(whole) = shaft.as_ref().filter(|_| apart) else {
             let shaft = shaft.as_ref();
@@ -393,6 +415,9 @@ impl<S: Simd> Bvh<'_, S> {
             } else {
                 self.gather(&narrow, cut.nodes(), rays, part.len(), inner_cut, inner, counter)
             };
+            if !closed {
+                inner.count = 0;
+            }
             useful += u32::from(closed);
             if closed && inner.count == 0 {
                 counter.rays(rays as u32);
@@ -496,6 +521,14 @@ impl<S: Simd> Bvh<'_, S> {
             let (mut from, end) = (first as usize, first as usize + count as usize);
             while from < end {
                 let part = (end - from).min(MOST);
+                let mut word = 0;
+                if !complete && part >= MIXED && beams.hidden != 0 {
+                    word = self.simd.apart(
+                        #[inline(always)]
+                        || beams.hides(self.simd, targets, from, part),
+                    );
+                    counter.rays(word.count_ones());
+                }
                 if !complete && (SORTED..MIXED).contains(&part) && beams.wanted() {
                     self.put_by(beams, x, targets, from, u64::MAX >> (64 - part));
                 } else if part < FEW || (!complete && part < MIXED) {
@@ -528,15 +561,14 @@ impl<S: Simd> Bvh<'_, S> {
                     };
                     set(blocked, from, word);
                 } else {
-                    let mut ask = u64::MAX >> (64 - part);
-                    let mut word = 0;
+                    let mut ask = u64::MAX >> (64 - part) & !word;
                     let aimed = ask != 0
                         && (learned.count > 0 || !walls.is_empty())
                         && batch.pyramid.aim(self.simd, x.into(), targets, from, part, self.magnitude);
                     if aimed && !walls.is_empty() {
-                        word = walls.hide(self.simd, &batch.pyramid, counter);
-                        ask &= !word;
-                        counter.rays(word.count_ones());
+                        let hidden = ask & walls.hide(self.simd, &batch.pyramid, counter);
+                        (word, ask) = (word | hidden, ask & !hidden);
+                        counter.rays(hidden.count_ones());
                     }
                     if aimed && learned.count > 0 && ask != 0 {
                         let asked = ask.count_ones();
@@ -942,8 +974,8 @@ impl<S: Simd> Bvh<'_, S> {
         hides
     }
 
-    /// Goes down the tree with the shaft. True if the list holds all that may block anything; else what is not
-    /// in it is below the cut.
+    /// Goes down the tree with the shaft. True if the list holds all that may block anything; else it holds what was come
+    /// to, and the cut all there is.
     #[allow(clippy::too_many_arguments)]
     #[inline(always)]
     fn gather(
@@ -1008,8 +1040,6 @@ impl<S: Simd> Bvh<'_, S> {
                 break;
             }
         }
-        // A list that is not all there is would be asked for nothing as often as not.
-        list.count = 0;
         cut.keep();
         false
     }
