@@ -232,8 +232,6 @@ fn rays_that_are_sorted_and_rays_that_are_not() {
     assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
 }
 
-/// Walls along the axes that a light touches, which is turned to them: their planes are told from its corners by the last
-/// bits of either.
 /// A ceiling with holes under a large light, amid confetti: too much for a list, and no sheet hides all.
 #[test]
 fn parts_of_a_large_light_behind_a_ceiling() {
@@ -294,6 +292,50 @@ fn parts_of_a_large_light_behind_a_ceiling() {
     assert!(nodes[0] * 10 < nodes[1] * 8, "{nodes:?}");
 }
 
+/// A light that is next to no parallelogram, and a wall next to it: the box around its targets must hold them.
+#[test]
+fn lights_whose_edges_are_all_but_parallel() {
+    let mut random = Random::new(77);
+    let mut scratch = TileScratch::new();
+    let mut total = [0, 0];
+    for trial in 0..600 {
+        let along = random.direction();
+        let across = along.cross(random.direction()).normalize();
+        let thin = random.any_scale(-6.0, -1.0);
+        let (u, v) = (along, along * 0.9 + across * thin);
+        let middle = random.direction() * 3.0;
+        let corner = middle - (u + v) * 0.5;
+        let wall = middle + middle.normalize() * [1e-4, -1e-4][trial % 2];
+        let side = along.cross(middle).normalize();
+        let wall = [wall - (along + side) * 9.0, wall + (along - side) * 9.0, wall + side * 9.0];
+        let accel = Accel::from_triangles(&[wall], Quality::High);
+        let single = On { bvh: accel.bvh(), family: Family::Scalar };
+        let points: Vec<TilePoint> = (0..64)
+            .map(|k| {
+                let at = Vec3::new((k % 8) as f32, (k / 8) as f32, 0.0) * 0.001;
+                TilePoint { x: at.to_array(), first: k * 16, count: 16 }
+            })
+            .collect();
+        let ends: Vec<Vec3> = (0..1024).map(|_| corner + u * random.unit() + v * random.unit()).collect();
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let targets = Targets::new(&xs, &ys, &zs).expect("of one length").on_parallelogram(corner, u, v);
+        let mut want = [0u64; 16];
+        for (i, &end) in ends.iter().enumerate() {
+            let hit = single.occluded(&Ray::segment(points[i / 16].x, end), None, &mut Counts::default());
+            want[i / 64] |= u64::from(hit) << (i % 64);
+            total[usize::from(hit)] += 1;
+        }
+        for on in families(accel.bvh()) {
+            let mut blocked = [0; 16];
+            on.occluded_tile(&points, &targets, None, &mut Counts::default(), &mut scratch, &mut blocked);
+            assert_eq!(blocked, want, "{}, trial {trial}, {thin}", on.family);
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
+}
+
+/// Walls along the axes that a light touches, which is turned to them: their planes are told from its corners by the last
+/// bits of either.
 #[test]
 fn walls_at_the_corner_of_a_light() {
     let mut random = Random::new(23);

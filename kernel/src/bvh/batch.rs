@@ -10,6 +10,10 @@ use crate::ray::Ray;
 use crate::vec3x;
 use glam::Vec3;
 
+/// The less a parallelogram is one, the less exactly are its normal and places on it told: the least square of the sine
+/// between its edges.
+const THIN: f32 = 1e-5;
+
 /// The far ends of a batch: points on a light, one coordinate a slice, all of one length.
 #[derive(Clone, Copy, Debug)]
 pub struct Targets<'a> {
@@ -36,8 +40,10 @@ impl<'a> Targets<'a> {
         u: impl Into<[f32; 3]>,
         v: impl Into<[f32; 3]>,
     ) -> Self {
-        let plane = [Vec3::from(corner.into()), Vec3::from(u.into()), Vec3::from(v.into())];
-        Self { plane: Some(plane), ..self }
+        let [corner, u, v] = [Vec3::from(corner.into()), Vec3::from(u.into()), Vec3::from(v.into())];
+        // Written so that NaN is no plane.
+        let known = u.cross(v).length_squared() > THIN * u.length_squared() * v.length_squared();
+        Self { plane: if known { Some([corner, u, v]) } else { None }, ..self }
     }
 
     /// A corner and the edges at it of the light they lie on, if that is known.

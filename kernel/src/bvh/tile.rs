@@ -1083,14 +1083,20 @@ fn frame_of_points(points: &[TilePoint]) -> [Vec3; 3] {
     frame(normal, edge)
 }
 
-/// Three unit vectors at right angles, the last along `normal` and the first along `edge`; the axes where these
+/// Three unit vectors at right angles, the last about along `normal` and the first along `edge`; the axes where these
 /// are no good.
 #[inline(always)]
 pub(super) fn frame(normal: Vec3, edge: Vec3) -> [Vec3; 3] {
     let (normal, edge) = (normal.normalize_or_zero(), edge.normalize_or_zero());
     let third = normal.cross(edge);
     let size = third.length_squared();
-    if size > 0.25 && size < 2.0 { [edge, third, normal] } else { [Vec3::X, Vec3::Y, Vec3::Z] }
+    if size > 0.25 && size < 2.0 {
+        // The normal of a sliver is far from being at right angles to its edges.
+        let third = third.normalize();
+        [edge, third, edge.cross(third)]
+    } else {
+        [Vec3::X, Vec3::Y, Vec3::Z]
+    }
 }
 
 /// Points from the `from`th on, one a lane; the last of all once more in the lanes beyond it.

@@ -6,7 +6,9 @@
 //! axes tells it for as many cells as a vector holds.
 //!
 //! Cells that are not behind the triangle itself may be behind it and those beyond its edges. A sheet is grown over
-//! all cells together, each cell across the edges that its own segments may pass on the outer side. What hides the cells
+//! all cells together, each cell across the edges that its own segments may pass on the outer side. A triangle may be come
+//! to more than once; but a segment that leaves one across an edge enters one that was come to later, and as there is an
+//! end to these, it meets one of them. What hides the cells
 //! of a light is near them as a rule, large, and high up in the tree, and so among the first triangles that a shaft comes
 //! to before there are too many for a list: nothing has to be looked for.
 
@@ -488,9 +490,10 @@ mod tests {
             let mut triangles = [[Vec3::ZERO; 3]; 32];
             let count = sheet(&mut numbers, &mut triangles);
             let triangles = &triangles[..count];
-            let hidden_here = hidden(Native, &shaft, &grid, triangles);
+            // Families round differently, and so may differ about a cell.
             let (scalar, scalar_grid) = shaft_and_grid(Scalar, shaft.points.axes[0].x);
-            assert_eq!(hidden(Scalar, &scalar, &scalar_grid, triangles), hidden_here);
+            let hidden_here =
+                hidden(Native, &shaft, &grid, triangles) | hidden(Scalar, &scalar, &scalar_grid, triangles);
             for (cell, (&column, &row)) in MIDDLES[0].iter().zip(&MIDDLES[1]).enumerate() {
                 let mut dark = true;
                 for k in 0..40 {
