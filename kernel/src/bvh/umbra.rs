@@ -30,7 +30,7 @@ const LISTED: usize = 64;
 const LARGEST: usize = 24;
 const LOOKS: usize = 48;
 
-/// Triangles that cover less, in cells, hide none.
+/// Triangles that cover less, in cells, hide none by themselves, and are not worth a look.
 const SMALLEST: f32 = 1.0;
 
 /// If as many hide nothing, nor will the others.
