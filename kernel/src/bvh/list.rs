@@ -30,6 +30,9 @@ pub(super) struct List {
 impl List {
     pub(super) const MOST: usize = 128;
 
+    /// As many a shaft may list at most.
+    pub(super) const ROOM: usize = 64;
+
     pub(super) const EMPTY: Self = Self {
         blocks: [TriangleBlock::EMPTY; List::MOST / TriangleBlock::WIDTH],
         scores: [0.0; List::MOST / TriangleBlock::WIDTH],

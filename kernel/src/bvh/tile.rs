@@ -1008,7 +1008,7 @@ impl<S: Simd> Bvh<'_, S> {
     ) -> bool {
         let [share, least, most] = STEPS;
         let steps = (rays / share).clamp(least, most);
-        let room = if rays < FEW * points { 8 } else { 64 };
+        let room = if rays < FEW * points { 8 } else { List::ROOM };
         (cut.count, list.count) = (0, 0);
         let (mut head, mut len) = (0, 0);
         let mut done = 0;
@@ -1205,6 +1205,25 @@ fn set(blocked: &mut [u64], first: usize, word: u64) {
         blocked[first / 64] |= word << bit;
         if bit != 0 && word >> (64 - bit) != 0 {
             blocked[first / 64 + 1] |= word >> (64 - bit);
+        }
+    }
+}
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn frames_are_at_right_angles_whatever_they_are_made_of() {
+        let edge = Vec3::new(0.8, -0.36, 0.48);
+        for away in [Vec3::new(0.6, 0.48, -0.64), Vec3::new(0.0, 0.8, 0.6), Vec3::ONE] {
+            for lean in [0.0, 1e-3, 0.1, 0.5, 1.0, 10.0] {
+                let frame = frame(away + edge * lean, edge * 1e-3);
+                for k in 0..3 {
+                    assert!((frame[k].length() - 1.0).abs() < 1e-6, "{away} {lean} {frame:?}");
+                    assert!(frame[k].dot(frame[(k + 1) % 3]).abs() < 1e-6, "{away} {lean} {frame:?}");
+                }
+            }
         }
     }
 }

@@ -24,7 +24,7 @@ use arrayvec::ArrayVec;
 use glam::Vec3;
 
 /// Of so many triangles, the first of a list, one may be part of a sheet.
-const LISTED: usize = 64;
+const LISTED: usize = List::ROOM;
 
 /// Those that cover most are looked at, and in all so many with those beyond their edges.
 const LARGEST: usize = 24;
@@ -60,6 +60,11 @@ struct Sides {
     turned: bool,
 }
 
+impl Sides {
+    /// Hides nothing.
+    const NOTHING: Self = Self { beyond: 0, inside: [0; 3], middle: 0, turned: false };
+}
+
 /// Room for what is known of a tile's triangles.
 pub(super) struct Umbra {
     sides: [Sides; LISTED],
@@ -78,11 +83,7 @@ struct Asked<'a> {
 }
 
 impl Umbra {
-    pub(super) const NOTHING: Self = Self {
-        sides: [Sides { beyond: 0, inside: [0; 3], middle: 0, turned: false }; LISTED],
-        known: 0,
-        pause: 0,
-    };
+    pub(super) const NOTHING: Self = Self { sides: [Sides::NOTHING; LISTED], known: 0, pause: 0 };
 
     /// The cells of the light that sheets of the triangles of a list hide from all points of the shaft; none where it was
     /// of no use lately.
@@ -215,7 +216,7 @@ impl Umbra {
             self.known |= 1 << triangle;
             let (block, lane) = (triangle / TriangleBlock::WIDTH, triangle % TriangleBlock::WIDTH);
             self.sides[triangle] = if *looks == 0 {
-                Sides { beyond: 0, inside: [0; 3], middle: 0, turned: false }
+                Sides::NOTHING
             } else {
                 *looks -= 1;
                 sides_of(simd, asked.shaft, asked.grid, &asked.list.blocks[block], lane)
@@ -265,7 +266,7 @@ fn sides_of<S: Simd>(simd: S, shaft: &Shaft, grid: &Grid, block: &TriangleBlock,
     let turned = n.dot(shaft.between) < 0.0;
     let sign = if turned { -1.0 } else { 1.0 };
     let n = n * sign;
-    let mut sides = Sides { beyond: 0, inside: [0; 3], middle: 0, turned };
+    let mut sides = Sides { turned, ..Sides::NOTHING };
     let [near, far] = shaft.farthest;
     let length = near + far;
     // Twice the margins of one light, as there are twice as many sums.
