@@ -886,17 +886,22 @@ fn dot<S: Simd>(token: S::Token, row: Vec3, d: [S::Packet; 3]) -> S::Packet {
     d[0].mul_add(x, d[1].mul_add(y, d[2] * z))
 }
 
+/// May lose what is not a number.
 #[inline(always)]
 pub(super) fn least_of<L: Lanes>(v: L) -> f32 {
     let mut lanes = [f32::INFINITY; 16];
     v.store(&mut lanes);
-    let mut least = lanes[0];
-    let mut i = 1;
-    while i < L::WIDTH {
-        least = if lanes[i] < least { lanes[i] } else { least };
-        i += 1;
+    // Each half against the other: one by one, every step would wait for the last.
+    let mut half = L::WIDTH / 2;
+    while half > 0 {
+        let mut i = 0;
+        while i < half {
+            lanes[i] = if lanes[i + half] < lanes[i] { lanes[i + half] } else { lanes[i] };
+            i += 1;
+        }
+        half /= 2;
     }
-    least
+    lanes[0]
 }
 
 /// NaN if any lane is.
@@ -904,13 +909,16 @@ pub(super) fn least_of<L: Lanes>(v: L) -> f32 {
 pub(super) fn sum_of<L: Lanes>(v: L) -> f32 {
     let mut lanes = [0.0; 16];
     v.store(&mut lanes);
-    let mut sum = 0.0;
-    let mut i = 0;
-    while i < L::WIDTH {
-        sum += lanes[i];
-        i += 1;
+    let mut half = L::WIDTH / 2;
+    while half > 0 {
+        let mut i = 0;
+        while i < half {
+            lanes[i] += lanes[i + half];
+            i += 1;
+        }
+        half /= 2;
     }
-    sum
+    lanes[0]
 }
 
 #[inline(always)]
