@@ -197,6 +197,53 @@ struct Destination<'a> {
     asked: &'a Path,
     file: PathBuf,
     existing: Option<Metadata>,
+    stream: Option<Stream>,
+}
+
+/// Something that is open already, under its name in the file system. What is behind it may be a file with other things in
+/// it, such as a log, of which no other file may take the place.
+#[derive(Clone, Copy, Debug, PartialEq, Eq)]
+enum Stream {
+    Stdout,
+    Stderr,
+    /// Of another number, or of another program.
+    Other,
+}
+
+impl Stream {
+    fn named(path: &Path) -> Option<Self> {
+        let path = path.to_str()?;
+        let number = match path {
+            "/dev/stdout" => "1",
+            "/dev/stderr" => "2",
+            _ => {
+                let own = ["/dev/fd/", "/proc/self/fd/"].into_iter().find_map(|at| path.strip_prefix(at));
+                let of_any = || path.strip_prefix("/proc/")?.split_once("/fd/").map(|(_, number)| number);
+                match own {
+                    Some(number) => number,
+                    None => return of_any().map(|_| Self::Other),
+                }
+            }
+        };
+        Some(match number {
+            "1" => Self::Stdout,
+            "2" => Self::Stderr,
+            _ => Self::Other,
+        })
+    }
+
+    /// Adds to what is there.
+    fn write(self, path: &Path, bytes: &[u8]) -> std::io::Result<()> {
+        match self {
+            Self::Stdout => {
+                let mut stdout = std::io::stdout().lock();
+                stdout.write_all(bytes)?;
+                stdout.flush()
+            }
+            Self::Stderr => std::io::stderr().lock().write_all(bytes),
+            Self::Other => fs::OpenOptions::new().append(true).open(path)?.write_all(bytes),
+        }
+    }
 }
 
 impl<'a> Destination<'a> {
@@ -215,10 +262,19 @@ impl<'a> Destination<'a> {
         // The links to a pipe lead nowhere, as those of /dev/stdout may.
         let is_special = fs::metadata(asked).is_ok_and(|m| !m.is_file() && !m.is_dir());
         // By hand, because the link may point to a file that is yet to be made.
-        let most = if is_special { 0 } else { 40 };
-        for _ in 0..most {
-            let Ok(target) = fs::read_link(&file) else { break };
-            file = folder(&file).join(target);
+        let mut stream = Stream::named(&file);
+        for _ in 0..40 {
+            let Ok(target) = fs::read_link(&file).map(|target| folder(&file).join(target)) else { break };
+            if stream.is_some() {
+                break;
+            }
+            stream = Stream::named(&target);
+            if !is_special || stream.is_some() {
+                file = target;
+            }
+        }
+        if stream.is_some() {
+            return Ok(Self { asked, file, existing: None, stream });
         }
         let refuse = |why: String| Err(Error::Usage(format!("writing {}: {why}", asked.display())));
         if !is_special && file.is_symlink() {
@@ -234,7 +290,7 @@ impl<'a> Destination<'a> {
             return refuse("it ends like the name of a folder; name a file".into());
         }
         match fs::metadata(folder(&file)) {
-            Ok(m) if m.is_dir() => Ok(Self { asked, file, existing }),
+            Ok(m) if m.is_dir() => Ok(Self { asked, file, existing, stream }),
             Ok(_) => refuse(format!("{} is not a folder", folder(&file).display())),
             Err(e) if e.kind() == ErrorKind::NotFound => {
                 refuse(format!("the folder {} does not exist; make it first", folder(&file).display()))
@@ -243,9 +299,9 @@ impl<'a> Destination<'a> {
         }
     }
 
-    /// A device or a pipe, which a rename would replace by a file.
+    /// A device, a pipe or what is open already, which a rename would replace by a file.
     fn is_special(&self) -> bool {
-        self.existing.as_ref().is_some_and(|m| !m.is_file())
+        self.stream.is_some() || self.existing.as_ref().is_some_and(|m| !m.is_file())
     }
 
     fn temporary(&self) -> Result<tempfile::NamedTempFile> {
@@ -276,6 +332,9 @@ impl<'a> Destination<'a> {
 
     fn save(&self, bytes: &[u8]) -> Result<()> {
         let failed = || Error::io("writing", self.asked);
+        if let Some(stream) = self.stream {
+            return stream.write(&self.file, bytes).map_err(failed());
+        }
         if self.is_special() {
             return fs::write(&self.file, bytes).map_err(failed());
         }
@@ -364,10 +423,14 @@ fn encode_pfm(image: &Image) -> Vec<u8> {
 
 fn decode_image(bytes: &[u8], format: image::ImageFormat) -> Decoded<Image> {
     let kind = if format == image::ImageFormat::Png { "PNG" } else { "Radiance HDR" };
-    let decoded = image::ImageReader::with_format(Cursor::new(bytes), format)
-        .decode()
-        .map_err(|e| format!("not a readable {kind} file: {e}"))?
-        .into_rgb32f();
+    let unreadable = |e: image::ImageError| format!("not a readable {kind} file: {e}");
+    let reader = || image::ImageReader::with_format(Cursor::new(bytes), format);
+    // Sizes first, as any image that can be written can be read, however large.
+    let (width, height) = reader().into_dimensions().map_err(unreadable)?;
+    check_size(width.into(), height.into())?;
+    let mut reader = reader();
+    reader.no_limits();
+    let decoded = reader.decode().map_err(unreadable)?.into_rgb32f();
     let linear = |v: f32| if format == image::ImageFormat::Png { srgb_decode(v) } else { v };
     let (width, height) = decoded.dimensions();
     Ok(Image { width, height, pixels: decoded.pixels().map(|p| p.0.map(linear)).collect() })
