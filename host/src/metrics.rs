@@ -114,10 +114,7 @@ impl Comparison {
 /// Takes one pass for the means and one for everything else, and sorts one number per pixel.
 pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
     check_sizes(test, reference)?;
-    let bad = reference.pixels.iter().filter(|p| !p.iter().all(|v| v.is_finite())).count();
-    if bad > 0 {
-        return Err(Error::Usage(format!("the reference has {bad} pixels that are not finite numbers")));
-    }
+    check_finite(reference)?;
     let compared = test.pixels.iter().filter(|p| p.iter().all(|v| v.is_finite())).count();
     if compared == 0 {
         return Err(Error::Usage(
@@ -179,6 +176,17 @@ pub fn compare(test: &Image, reference: &Image) -> Result<Comparison> {
         worst: largest(&blocks, |b| b.z),
         most_biased: largest(&blocks, |b| b.bias),
     })
+}
+
+/// Whether an image can be a reference: all of its pixels have to be finite numbers.
+pub fn check_finite(reference: &Image) -> Result<()> {
+    let bad = reference.pixels.iter().filter(|p| !p.iter().all(|v| v.is_finite())).count();
+    if bad > 0 {
+        return Err(Error::Usage(format!(
+            "the reference has {bad} pixels that are not finite numbers: render it again, or name another one"
+        )));
+    }
+    Ok(())
 }
 
 /// Whether two images have the same size, at least one pixel, and as many pixels as the size says.

@@ -44,7 +44,12 @@ fn report(args: &CompareArgs) -> Result<String> {
         output::check_apart(&[("--output", path)], &[("the image", &args.a), ("the reference", &args.b)])?;
     }
     let (test, reference) = (output::read(&args.a)?, output::read(&args.b)?);
-    let comparison = compare(&test, &reference)?;
+    // The images do not know their names.
+    let of_both = |error: Error| match error {
+        Error::Usage(what) => Error::input(&args.a, format!("held against {}: {what}", args.b.display())),
+        error => error,
+    };
+    let comparison = compare(&test, &reference).map_err(of_both)?;
     let seen = flip(&test, &reference, args.exposure, flip::PIXELS_PER_DEGREE)?;
     let scale = match &args.output {
         Some(path) => write_difference(path, &test, &reference)?,

@@ -398,7 +398,8 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     }
     let camera = scene.camera.ok_or_else(|| Error::input(&args.scene, "has no camera"))?;
     let size = (camera.width, camera.height);
-    if let Some(reference) = &reference {
+    if let (Some(reference), Some(path)) = (&reference, &args.reference) {
+        metrics::check_finite(reference).map_err(|error| Error::input(path, error.to_string()))?;
         let has = (reference.width, reference.height);
         if has != size {
             return Err(Error::Usage(format!(
