@@ -1,6 +1,6 @@
 //! `occlude generate`: a scene of any size, for measuring.
 
-use super::{number, whole};
+use super::{Ended, interruptible, number, whole};
 use crate::error::Result;
 use crate::generate::{self, Kind, MOST_TRIANGLES};
 use std::io::{self, Write};
@@ -28,13 +28,15 @@ pub struct GenerateArgs {
 }
 
 /// Generates, writes, and says in one line what was written.
-pub fn run(args: &GenerateArgs) -> Result<()> {
+pub fn run(args: &GenerateArgs) -> Result<Ended> {
     let folder = args.output.clone().unwrap_or_else(|| PathBuf::from(args.name.name()));
+    let check = || if args.force { Ok(()) } else { generate::check_empty(&folder) };
+    check()?;
     let scene = generate::generate(args.name, args.seed, args.triangles);
-    if args.force {
-        generate::overwrite(&scene, &folder)?
-    } else {
-        generate::write(&scene, &folder)?
+    check()?;
+    // Before that there is nothing to clean up.
+    if !generate::overwrite_unless(&scene, &folder, &interruptible("room on the disk"))? {
+        return Ok(Ended::Interrupted);
     }
     // Whoever closed the pipe does not want to read this.
     let _ = writeln!(
@@ -45,7 +47,7 @@ pub fn run(args: &GenerateArgs) -> Result<()> {
         scene.positions.len(),
         scene.materials.len()
     );
-    Ok(())
+    Ok(Ended::Done)
 }
 
 /// A count of triangles, as people write it: `1000000`, `1_000_000`, `1e6`, `250k`, `1.5M`.

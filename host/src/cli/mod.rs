@@ -84,7 +84,7 @@ pub fn run() -> ExitCode {
         Command::CompareMethods(args) => compare_methods::run(args, level),
         Command::Map(args) => learn::run(args, level),
         Command::Photons(args) => photons::run(args, level).map(|()| Ended::Done),
-        Command::Generate(args) => generate::run(args).map(|()| Ended::Done),
+        Command::Generate(args) => generate::run(args),
         Command::Reproduce(args) => reproduce::run(args, level),
     };
     match ended {

@@ -15,7 +15,7 @@ mod spheres;
 mod sponge;
 mod write;
 
-pub use write::{overwrite, write};
+pub use write::{check_empty, overwrite, overwrite_unless, write};
 
 use crate::accel::Accel;
 use crate::scene::Scene;

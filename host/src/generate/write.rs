@@ -7,6 +7,7 @@ use std::collections::BTreeSet;
 use std::fs::{self, File};
 use std::io::{self, BufWriter, Write};
 use std::path::{Path, PathBuf};
+use std::sync::atomic::{AtomicBool, Ordering};
 
 /// Vertices or triangles in one piece of text, and pieces written at a time.
 const PIECE: usize = 1 << 14;
@@ -17,6 +18,12 @@ const PIECES: usize = 64;
 /// Every coordinate is written with as many digits as give back the same `f32`, and the order of
 /// vertices and triangles is kept. Nothing that is half written ever bears the name of a scene file.
 pub fn write(scene: &Scene, folder: &Path) -> Result<()> {
+    check_empty(folder)?;
+    overwrite(scene, folder)
+}
+
+/// Refuses a folder that has anything in it.
+pub fn check_empty(folder: &Path) -> Result<()> {
     let occupied = match fs::read_dir(folder) {
         Ok(mut entries) => entries.next().is_some(),
         Err(error) if error.kind() == io::ErrorKind::NotFound => false,
@@ -26,7 +33,7 @@ pub fn write(scene: &Scene, folder: &Path) -> Result<()> {
     if occupied {
         return Err(Error::input(folder, "the folder is not empty: name another one, or pass --force"));
     }
-    overwrite(scene, folder)
+    Ok(())
 }
 
 fn not_a_folder(path: &Path) -> Error {
@@ -35,18 +42,61 @@ fn not_a_folder(path: &Path) -> Error {
 
 /// Like [`write()`], but replaces a scene that is there. Other files in the folder stay.
 pub fn overwrite(scene: &Scene, folder: &Path) -> Result<()> {
+    overwrite_unless(scene, folder, &AtomicBool::new(false)).map(drop)
+}
+
+/// Like [`overwrite`], but leaves everything as it was if `stop` is set before all is written. Was it written?
+pub fn overwrite_unless(scene: &Scene, folder: &Path, stop: &AtomicBool) -> Result<bool> {
     if fs::metadata(folder).is_ok_and(|there| !there.is_dir()) {
         return Err(not_a_folder(folder));
     }
+    let is_new = !folder.exists();
     fs::create_dir_all(folder).map_err(Error::io("creating", folder))?;
+    let drafted = drafts(scene, folder, stop);
+    if stop.load(Ordering::Relaxed) {
+        drop(drafted);
+        if is_new {
+            // Something else may have come into it.
+            let _ = fs::remove_dir(folder);
+        }
+        return Ok(false);
+    }
+    let drafts = drafted?;
+    // Or some would be replaced and others not.
+    if let Some(draft) = drafts.iter().find(|draft| draft.path.is_dir()) {
+        return Err(Error::input(&draft.path, "this is a folder, and a file is to be written: move it away"));
+    }
+    drafts.into_iter().try_for_each(Draft::publish).map(|()| true)
+}
+
+fn drafts(scene: &Scene, folder: &Path, stop: &AtomicBool) -> Result<Vec<Draft>> {
     let names = material_names(&scene.materials);
     let mut drafts = Vec::new();
     if let Some(camera) = &scene.camera {
-        drafts.push(draft(folder, "camera.json", |file| write_camera(camera, file))?);
+        drafts.push(draft(folder, "camera.json", stop, |file| write_camera(camera, file))?);
     }
-    drafts.push(draft(folder, "scene.mtl", |file| write_materials(&scene.materials, &names, file))?);
-    drafts.push(draft(folder, "scene.obj", |file| write_mesh(scene, &names, file))?);
-    drafts.into_iter().try_for_each(Draft::publish)
+    drafts.push(draft(folder, "scene.mtl", stop, |file| write_materials(&scene.materials, &names, file))?);
+    drafts.push(draft(folder, "scene.obj", stop, |file| write_mesh(scene, &names, file))?);
+    Ok(drafts)
+}
+
+/// A file that takes nothing more once it is to stop.
+struct Stoppable<'a> {
+    file: File,
+    stop: &'a AtomicBool,
+}
+
+impl Write for Stoppable<'_> {
+    fn write(&mut self, bytes: &[u8]) -> io::Result<usize> {
+        if self.stop.load(Ordering::Relaxed) {
+            return Err(io::Error::other("it was to stop"));
+        }
+        self.file.write(bytes)
+    }
+
+    fn flush(&mut self) -> io::Result<()> {
+        self.file.flush()
+    }
 }
 
 /// A file under a temporary name; gone when dropped, unless it was published.
@@ -71,13 +121,14 @@ impl Drop for Draft {
 fn draft(
     folder: &Path,
     name: &str,
-    fill: impl FnOnce(&mut BufWriter<File>) -> io::Result<()>,
+    stop: &AtomicBool,
+    fill: impl FnOnce(&mut BufWriter<Stoppable<'_>>) -> io::Result<()>,
 ) -> Result<Draft> {
     let path = folder.join(name);
     let temporary = folder.join(format!(".{name}.{}.tmp", std::process::id()));
     let file = File::create(&temporary).map_err(Error::io("writing", &path))?;
     let draft = Draft { temporary, path };
-    let mut file = BufWriter::with_capacity(1 << 18, file);
+    let mut file = BufWriter::with_capacity(1 << 18, Stoppable { file, stop });
     fill(&mut file).and_then(|()| file.flush()).map_err(Error::io("writing", &draft.path))?;
     Ok(draft)
 }
