@@ -10,6 +10,7 @@ use crate::metrics::flip;
 use crate::page::{
     Axis, Crop, Data, Entry, Figure, Gallery, Page, Picture, Plot, Series, Strip, Table, Tone, heat, number,
 };
+use crate::render::check_room;
 use crate::reproduce::{Halted, Reproduced, Run};
 use clap::ValueEnum;
 use occlude_kernel::Counts;
@@ -239,6 +240,10 @@ fn compare(
 ) -> Result<Reproduced, Halted> {
     let began = Instant::now();
     let size = comparison.size;
+    // The reference and every method have a film and pictures; and one is being rendered or shown.
+    let image = size_of::<[f32; 3]>();
+    let films = (comparison.methods.len() + 1) * (Film::BYTES_A_PIXEL[0] + 2 * image);
+    check_room(size, films + 6 * image)?;
     let prepared = {
         let start = clock::of_process();
         let wanted = comparison.methods.contains(&Method::Map);

@@ -111,12 +111,28 @@ fn check_memory((width, height): (u32, u32), adaptive: bool) -> crate::Result<()
     let [film, listening] = Film::BYTES_A_PIXEL;
     let image = size_of::<[f32; 3]>();
     let films = if adaptive { 2 * (film + listening) + Needs::BYTES_A_PIXEL } else { film };
-    let bytes = u64::from(width) * u64::from(height) * (films + 6 * image) as u64;
+    check_room((width, height), films + 6 * image)
+}
+
+/// What the system could still give, bytes, where it says so.
+fn available_memory() -> Option<u64> {
+    let said = std::fs::read_to_string("/proc/meminfo").ok()?;
+    let kilobytes = |key: &str| {
+        let line = said.lines().find_map(|line| line.strip_prefix(key)?.strip_prefix(':'))?;
+        line.trim().strip_suffix("kB")?.trim().parse::<u64>().ok()
+    };
+    Some((kilobytes("MemAvailable")? + kilobytes("SwapFree").unwrap_or(0)).saturating_mul(1024))
+}
+
+/// Refuses an image of so many bytes a pixel that there is no memory for.
+pub(crate) fn check_room((width, height): (u32, u32), bytes_a_pixel: usize) -> crate::Result<()> {
+    let bytes = u64::from(width) * u64::from(height) * bytes_a_pixel as u64;
     let mut room = Vec::<u8>::new();
     let got = usize::try_from(bytes).is_ok_and(|bytes| room.try_reserve_exact(bytes).is_ok());
     // Or the compiler would take it for had.
     std::hint::black_box(&mut room);
-    if got {
+    // Some systems promise more than they have.
+    if got && available_memory().is_none_or(|available| bytes <= available) {
         return Ok(());
     }
     Err(crate::Error::Usage(format!(

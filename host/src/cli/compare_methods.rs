@@ -36,11 +36,11 @@ pub(super) struct CompareMethodsArgs {
     spp: u32,
 
     /// Shadow rays a camera sample, over all lights together.
-    #[arg(long, default_value_t = 64, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
+    #[arg(long, default_value_t = 64, value_name = "N", value_parser = whole::<u32>(1..=65536))]
     shadow_rays: u32,
 
     /// Shadow rays of the reference.
-    #[arg(long, default_value_t = 1024, value_name = "N", value_parser = whole::<u32>(1..=1_000_000))]
+    #[arg(long, default_value_t = 1024, value_name = "N", value_parser = whole::<u32>(1..=65536))]
     reference_rays: u32,
 
     /// How long to look for a good tree.

@@ -69,6 +69,7 @@ enum Show {
 
 /// Light samples a point is judged by, when it is asked whether the map is right.
 const TRUTH: u32 = 64;
+const MOST_TRUTH: u32 = 65536;
 
 /// Runs the command.
 pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
@@ -150,13 +151,18 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     }
     let dots = || dotted(&stage, base.clone(), &points);
     let classes =
-        || classified(&Stage { shadow_rays: TRUTH * lights.len() as u32, ..stage }, &prepared, base.clone());
+        || classified(&Stage { shadow_rays: truth(lights.len()), ..stage }, &prepared, base.clone());
     let image = match args.show {
         Show::Photons => dots(),
         Show::Classes => classes(),
         Show::Both => beside(&dots(), &classes()),
     };
     output::write(&args.output, &image, None, 0.0)
+}
+
+/// Rays of a point to so many lights: as many to each, but no more in all than there is memory for in a tile.
+fn truth(lights: usize) -> u32 {
+    u32::try_from(lights).unwrap_or(u32::MAX).saturating_mul(TRUTH).min(MOST_TRUTH)
 }
 
 /// A colour for a number, far from those of its neighbours.
