@@ -91,6 +91,9 @@ pub fn run(args: &ReproduceArgs, level: Level) -> Result<Ended> {
         What::Theory(of) => (&of.common, &of.output, theory::MAKER, &theory::FILES[..]),
         What::Map(of) => (&of.common, &of.output, map::MAKER, &map::FILES[..]),
     };
+    if let What::Map(MapPageArgs { scenes: Some(scenes), .. }) = what {
+        map::check_scenes(scenes)?;
+    }
     let folder = Folder::claim(output, maker, files, args.force)?;
     let stop = super::interruptible("the page");
     let progress = Progress::new(args.quiet);

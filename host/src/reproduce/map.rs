@@ -24,6 +24,7 @@ use rayon::prelude::*;
 use std::path::Path;
 use std::sync::atomic::{AtomicU64, Ordering};
 use std::time::{Duration, Instant};
+pub use ways::check_scenes;
 use ways::{Maps, OPTIMISED, PLAIN, ROUNDS, Recipe, TREELETS, Way, ways};
 
 /// The command, by which its pages know each other.

@@ -62,6 +62,11 @@ impl Camera {
             let across = (p.dot(right).abs() / tan_x).max(p.dot(up).abs() / tan_y);
             distance = distance.max(across - p.dot(forward));
         }
+        if distance <= 0.0 {
+            // All of it is seen from the target already.
+            let size = (hi - lo).length();
+            distance = if size > 0.0 { size } else { 1.0 };
+        }
         (target - forward * (distance * 1.05)).as_vec3()
     }
 

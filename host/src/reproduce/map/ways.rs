@@ -200,6 +200,15 @@ pub(super) fn own(folder: Option<&Path>) -> (Vec<std::path::PathBuf>, Vec<&'stat
     (found, skipped)
 }
 
+/// Refuses a folder that has none of them.
+pub fn check_scenes(folder: &Path) -> crate::Result<()> {
+    if own(Some(folder)).0.is_empty() {
+        let what = format!("has no folder {}: name the folder that the scenes are in", OWN.join(" or "));
+        return Err(crate::Error::input(folder, what));
+    }
+    Ok(())
+}
+
 /// The names of the repository's scenes.
 pub(super) fn own_names() -> String {
     OWN.join(" and ")
