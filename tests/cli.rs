@@ -226,6 +226,8 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["reproduce", "magic"], "magic"),
         (&["reproduce", "theory", "-o", &cornell], "--force"),
         (&["reproduce", "map", "-o", &cornell], "--force"),
+        (&["reproduce", "map", "--quick", "--scenes", &cornell], "no folder columns or fence"),
+        (&["compare-methods", &cornell, "--reference-rays", "1e6"], "65536"),
         (&["render", &cornell, "--photons", "9"], "--blockers map"),
         (&["render", &cornell, "--photon-rounds", "3"], "--blockers map"),
         (&["render", &cornell, "--method", "map", "--photon-rounds", "0"], "--photon-rounds"),
@@ -406,6 +408,81 @@ fn statistics_go_down_a_pipe() {
     }
 }
 
+/// Behind a stream may be a file, and in it what others wrote.
+#[cfg(unix)]
+#[test]
+fn statistics_are_added_to_a_log() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::os::unix::fs::symlink("/dev/stdout", folder.path().join("link.json")).expect("a link");
+    let log = folder.path().join("log.jsonl");
+    for to in ["/dev/stdout", "link.json", "/dev/stderr", "/dev/fd/1", "/proc/self/fd/1"] {
+        std::fs::write(&log, "before\n").expect("a log");
+        for _ in 0..2 {
+            let open = || std::fs::OpenOptions::new().append(true).open(&log).expect("the log");
+            let args = [
+                "render",
+                &scene("plates"),
+                "-o",
+                "a.pfm",
+                "--size",
+                "8x8",
+                "--spp",
+                "1",
+                "-q",
+                "--stats",
+                to,
+            ];
+            let done = Command::new(PROGRAM)
+                .args(args)
+                .current_dir(folder.path())
+                .stdout(open())
+                .stderr(open())
+                .status()
+                .expect("it starts");
+            assert_eq!(done.code(), Some(0), "{to}");
+        }
+        let said = std::fs::read_to_string(&log).expect("the log");
+        let rest = said.strip_prefix("before\n").unwrap_or_else(|| panic!("{to}: {said}"));
+        let records = serde_json::Deserializer::from_str(rest).into_iter::<serde_json::Value>();
+        let rays: Vec<_> =
+            records.map(|stats| stats.expect("JSON")["counts"]["camera_rays"].clone()).collect();
+        assert_eq!(rays, [64, 64], "{to}");
+        assert!(folder.path().join("link.json").is_symlink());
+        assert_eq!(std::fs::read_dir(folder.path()).expect("the folder").count(), 3, "{to}");
+    }
+}
+
+#[test]
+fn references_are_looked_at_before_anything_is_rendered() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let mut reference = b"PF\n2 1\n-1.0\n".to_vec();
+    reference.extend([1.0f32, 1.0, f32::NAN, 1.0, 1.0, 1.0].iter().flat_map(|v| v.to_le_bytes()));
+    std::fs::write(folder.path().join("r.pfm"), reference).expect("a reference");
+    let args = ["render", &scene("plates"), "-o", "a.pfm", "--size", "2x1", "--reference", "r.pfm"];
+    let done = occlude(&args, folder.path());
+    let said = text(&done.stderr);
+    assert_eq!(done.status.code(), Some(2), "{said}");
+    assert!(said.contains("r.pfm") && said.contains("1 pixels that are not finite"), "{said}");
+    assert!(!folder.path().join("a.pfm").exists());
+    let compared = occlude(&["compare", "r.pfm", "r.pfm"], folder.path());
+    let said = text(&compared.stderr);
+    assert_eq!(compared.status.code(), Some(2), "{said}");
+    assert!(said.contains("r.pfm: held against r.pfm"), "{said}");
+}
+
+#[test]
+fn a_target_before_the_scene_is_looked_at_from_behind_it() {
+    let folder = tempfile::tempdir().expect("a folder");
+    std::fs::copy(Path::new(&scene("plates")).join("scene.obj"), folder.path().join("scene.obj"))
+        .expect("a scene");
+    std::fs::copy(Path::new(&scene("plates")).join("scene.mtl"), folder.path().join("scene.mtl"))
+        .expect("colours");
+    let args =
+        ["render", "scene.obj", "-o", "a.pfm", "--size", "4x4", "--spp", "1", "--target", "600,450,1000"];
+    let done = occlude(&args, folder.path());
+    assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+}
+
 #[test]
 fn what_is_generated_renders() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -446,6 +523,24 @@ fn interrupting_keeps_what_there_is() {
     let said = interrupted(&args, folder.path());
     assert!(said.contains("interrupted after"), "{said}");
     assert!(folder.path().join("a.png").exists());
+}
+
+#[cfg(unix)]
+#[test]
+fn interrupting_the_writing_of_a_scene_leaves_nothing() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let args = ["generate", "spheres", "--triangles", "10M", "-o", "big"];
+    let mut child = Command::new(PROGRAM).args(args).current_dir(folder.path()).spawn().expect("it starts");
+    let big = folder.path().join("big");
+    while !big.exists() {
+        assert!(child.try_wait().expect("its state").is_none(), "it ended before it wrote");
+        std::thread::sleep(std::time::Duration::from_millis(2));
+    }
+    let killed = Command::new("kill").args(["-INT", &child.id().to_string()]).status().expect("kill");
+    assert!(killed.success());
+    let status = child.wait().expect("it ends");
+    assert_eq!(status.code(), Some(1));
+    assert!(!big.exists(), "{:?}", std::fs::read_dir(&big).map(Iterator::count));
 }
 
 /// What an earlier run wrote is better than nothing.
