@@ -226,6 +226,8 @@ fn errors_end_with_two_and_name_the_cause() {
         (&["reproduce", "magic"], "magic"),
         (&["reproduce", "theory", "-o", &cornell], "--force"),
         (&["reproduce", "map", "-o", &cornell], "--force"),
+        (&["info", "--size", "3x3"], "--size is for a scene"),
+        (&["photons", &cornell, "-o", "p.ply", "--show", "classes"], "--show is for images"),
         (&["reproduce", "map", "--quick", "--scenes", &cornell], "no folder columns or fence"),
         (&["compare-methods", &cornell, "--reference-rays", "1e6"], "65536"),
         (&["render", &cornell, "--photons", "9"], "--blockers map"),

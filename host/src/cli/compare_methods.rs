@@ -3,7 +3,7 @@
 use super::render::CameraArgs;
 use super::reproduce::{Progress, write};
 use super::{Ended, note, whole};
-use crate::accel::{Accel, Quality};
+use crate::accel::Quality;
 use crate::compare_methods::{Comparison, FILES, MAKER, Method, compare_methods};
 use crate::error::{Error, Result};
 use crate::integrator::{MapOptions, Stage};
@@ -80,7 +80,7 @@ pub(super) fn run(args: &CompareMethodsArgs, level: Level) -> Result<Ended> {
     }
     let camera = scene.camera.ok_or_else(|| Error::input(&args.scene, "has no camera"))?;
     let folder = Folder::claim(&args.output, MAKER, &FILES, args.force)?;
-    let accel = Accel::build(&scene, args.quality);
+    let accel = super::map::tree(&scene, args.quality, args.threads.into())?;
     let lights = light::lights(&scene);
     let frame = camera.frame();
     let stage = Stage {

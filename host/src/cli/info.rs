@@ -3,7 +3,7 @@
 use super::print;
 use super::render::CameraArgs;
 use crate::accel::{Accel, Quality};
-use crate::error::Result;
+use crate::error::{Error, Result};
 use crate::light::{self, Shape};
 use crate::volumetric::Volumes;
 use crate::{mesh, scene};
@@ -30,6 +30,9 @@ pub struct InfoArgs {
 
 /// Runs the command.
 pub fn run(args: &InfoArgs, level: Level) -> Result<()> {
+    if let (None, Some(option)) = (&args.scene, args.camera.given()) {
+        return Err(Error::Usage(format!("{option} is for a scene: name one, or leave the option out")));
+    }
     let mut text = machine(level);
     if let Some(path) = &args.scene {
         text += "\n";

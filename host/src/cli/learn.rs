@@ -2,7 +2,7 @@
 
 use super::render::{CameraArgs, Progress};
 use super::{Ended, note, print, whole};
-use crate::accel::{Accel, Quality};
+use crate::accel::Quality;
 use crate::error::{Error, Result};
 use crate::integrator::{Auto, AutoOptions, SavedMap, Stage};
 use crate::render::{Limits, render};
@@ -123,7 +123,7 @@ pub(super) fn run(args: &LearnArgs, level: Level) -> Result<Ended> {
     }
     output::check_apart(&[("--output", path)], &super::files_of(&scene))?;
     let camera = scene.camera.ok_or_else(|| Error::input(&args.input, "has no camera"))?;
-    let accel = Accel::build(&scene, args.quality);
+    let accel = super::map::tree(&scene, args.quality, args.threads.into())?;
     let lights = light::lights(&scene);
     let frame = camera.frame();
     let stage = Stage {

@@ -1,7 +1,7 @@
 //! The options of the occlusion map, which several commands share.
 
 use super::whole;
-use crate::accel::Quality;
+use crate::accel::{Accel, Quality};
 use crate::error::{Error, Result};
 use crate::integrator::{MapOptions, PreparedMap, Stage};
 use crate::light::AreaLight;
@@ -181,6 +181,14 @@ impl MapArgs {
 /// Finds the boxes inside closed meshes.
 pub fn volumes(scene: &Scene, lights: &[AreaLight], threads: usize) -> Result<Volumes> {
     Ok(pool(threads)?.install(|| Volumes::build(scene, lights)))
+}
+
+/// Builds the tree; the same for any number of threads, of which 0 is one a core.
+pub fn tree(scene: &Scene, quality: Quality, threads: usize) -> Result<Accel> {
+    if threads == 0 {
+        return Ok(Accel::build(scene, quality));
+    }
+    Ok(pool(threads)?.install(|| Accel::build(scene, quality)))
 }
 
 fn pool(threads: usize) -> Result<rayon::ThreadPool> {

@@ -3,7 +3,7 @@
 use super::map::{self, PhotonOptions};
 use super::render::CameraArgs;
 use super::{note, whole};
-use crate::accel::{Accel, Quality};
+use crate::accel::Quality;
 use crate::error::{Error, Result};
 use crate::film::{Image, Tile};
 use crate::integrator::{Exact, PreparedMap, Questions, Stage, Visibility, questions};
@@ -29,9 +29,9 @@ pub struct PhotonsArgs {
     #[arg(short, long, value_name = "FILE")]
     output: PathBuf,
 
-    /// What an image shows.
-    #[arg(long, value_enum, default_value_t)]
-    show: Show,
+    /// What an image shows [default: both].
+    #[arg(long, value_enum)]
+    show: Option<Show>,
 
     /// Photons drawn or written at most; of more, evenly spread ones.
     #[arg(long, default_value_t = 200_000, value_name = "N", value_parser = whole::<u64>(1..=u64::MAX))]
@@ -74,6 +74,13 @@ const MOST_TRUTH: u32 = 65536;
 /// Runs the command.
 pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     let cloud = args.output.extension().is_some_and(|extension| extension.eq_ignore_ascii_case("ply"));
+    let show = args.show.unwrap_or_default();
+    if cloud && args.show.is_some() {
+        return Err(Error::Usage(format!(
+            "--show is for images, and {} holds photons: leave it out, or name an image",
+            args.output.display()
+        )));
+    }
     if cloud {
         output::check_writable_bytes(&args.output)?;
     } else if output::is_image(&args.output) {
@@ -89,7 +96,7 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     output::check_apart(&[("--output", &args.output)], &super::files_of(&scene))?;
     let camera = scene.camera.ok_or_else(|| Error::input(&args.scene, "has no camera"))?;
     let (width, height) = (camera.width, camera.height);
-    let accel = Accel::build(&scene, args.quality);
+    let accel = map::tree(&scene, args.quality, args.threads.into())?;
     let lights = light::lights(&scene);
     let frame = camera.frame();
     let stage = Stage {
@@ -152,7 +159,7 @@ pub fn run(args: &PhotonsArgs, level: Level) -> Result<()> {
     let dots = || dotted(&stage, base.clone(), &points);
     let classes =
         || classified(&Stage { shadow_rays: truth(lights.len()), ..stage }, &prepared, base.clone());
-    let image = match args.show {
+    let image = match show {
         Show::Photons => dots(),
         Show::Classes => classes(),
         Show::Both => beside(&dots(), &classes()),

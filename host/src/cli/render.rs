@@ -2,7 +2,7 @@
 
 use super::map::{self, MapArgs};
 use super::{Ended, learn, note, whole};
-use crate::accel::{Accel, Quality};
+use crate::accel::Quality;
 use crate::error::{Error, Result};
 use crate::integrator::{
     Auto, AutoOptions, Exact, Form, Map, MapOptions, MapTerms, Rule, Settings, Split, Stage, Stochastic,
@@ -424,7 +424,7 @@ pub fn run(args: &RenderArgs, level: Level) -> Result<Ended> {
     output::check_apart(&written, &read)?;
 
     let start = Instant::now();
-    let accel = Accel::build(&scene, args.quality);
+    let accel = map::tree(&scene, args.quality, args.threads.into())?;
     let build = start.elapsed();
     let lights = light::lights(&scene);
     let frame = camera.frame();
