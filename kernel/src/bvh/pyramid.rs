@@ -886,7 +886,7 @@ fn dot<S: Simd>(token: S::Token, row: Vec3, d: [S::Packet; 3]) -> S::Packet {
     d[0].mul_add(x, d[1].mul_add(y, d[2] * z))
 }
 
-/// May lose what is not a number.
+/// May lose what is not a number, and others beside it.
 #[inline(always)]
 pub(super) fn least_of<L: Lanes>(v: L) -> f32 {
     let mut lanes = [f32::INFINITY; 16];
