@@ -126,9 +126,22 @@ pub fn check_writable_bytes(path: impl AsRef<Path>) -> Result<()> {
 /// Refuses an output that would overwrite an input, or another output.
 ///
 /// Each has the word that says what it is, like the option that names it, for the message. By whatever way a file is named,
-/// it is the same file. Devices and pipes are no files, and may be named as often as one likes.
+/// it is the same file. Devices, pipes and what is open already are no files: nothing takes their place, and they may be named
+/// as often as one likes. But the file behind an open one must not be an input.
 pub fn check_apart(outputs: &[(&str, &Path)], inputs: &[(&str, &Path)]) -> Result<()> {
     let inputs: Vec<_> = inputs.iter().map(|&(what, path)| (what, path, file_at(path))).collect();
+    for (what, path) in outputs {
+        let behind = Destination::of_any(path).ok().filter(|destination| destination.stream.is_some());
+        let behind = behind.and_then(|destination| fs::canonicalize(destination.file).ok());
+        let read = inputs.iter().find(|(.., read)| read.is_some() && *read == behind);
+        if let Some((input, its, _)) = read {
+            return Err(Error::Usage(format!(
+                "{what} {} would write to {input} {}, which is read: name another file",
+                path.display(),
+                its.display()
+            )));
+        }
+    }
     let outputs: Vec<_> = outputs.iter().map(|&(what, path)| (what, path, file_at(path))).collect();
     for (k, (what, path, file)) in outputs.iter().enumerate().filter(|(_, (.., file))| file.is_some()) {
         let named = format!("{what} {}", path.display());
@@ -219,10 +232,9 @@ impl Stream {
             _ => {
                 let own = ["/dev/fd/", "/proc/self/fd/"].into_iter().find_map(|at| path.strip_prefix(at));
                 let of_any = || path.strip_prefix("/proc/")?.split_once("/fd/").map(|(_, number)| number);
-                match own {
-                    Some(number) => number,
-                    None => return of_any().map(|_| Self::Other),
-                }
+                let number = own.or_else(of_any)?;
+                number.parse::<u32>().ok()?;
+                if own.is_some() { number } else { "" }
             }
         };
         Some(match number {
@@ -230,6 +242,14 @@ impl Stream {
             "2" => Self::Stderr,
             _ => Self::Other,
         })
+    }
+
+    /// Could it be written to?
+    fn check(self, path: &Path) -> std::io::Result<()> {
+        match self {
+            Self::Stdout | Self::Stderr => Ok(()),
+            Self::Other => fs::OpenOptions::new().append(true).open(path).map(drop),
+        }
     }
 
     /// Adds to what is there.
@@ -324,6 +344,9 @@ impl<'a> Destination<'a> {
     }
 
     fn check(&self) -> Result<()> {
+        if let Some(stream) = self.stream {
+            return stream.check(&self.file).map_err(Error::io("writing", self.asked));
+        }
         if self.is_special() {
             return Ok(());
         }
@@ -346,6 +369,31 @@ impl<'a> Destination<'a> {
         temporary.as_file().sync_all().map_err(failed())?;
         temporary.persist(&self.file).map_err(|e| failed()(e.error))?;
         Ok(())
+    }
+}
+
+/// Folders that were made for something, and are gone again if nothing came into them.
+#[derive(Debug)]
+pub(crate) struct MadeFolders(Vec<PathBuf>);
+
+impl MadeFolders {
+    /// Makes a folder, and those that it is in.
+    pub(crate) fn make(path: &Path) -> Result<Self> {
+        let missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
+        let made = Self(path.ancestors().take_while(missing).map(Path::to_owned).collect());
+        fs::create_dir_all(path).map_err(Error::io("creating", path))?;
+        Ok(made)
+    }
+}
+
+impl Drop for MadeFolders {
+    fn drop(&mut self) {
+        for folder in &self.0 {
+            // Refused if there is anything in it, as there should be. One may not have come to be.
+            if fs::remove_dir(folder).is_err_and(|error| error.kind() != ErrorKind::NotFound) {
+                break;
+            }
+        }
     }
 }
 
@@ -428,6 +476,8 @@ fn decode_image(bytes: &[u8], format: image::ImageFormat) -> Decoded<Image> {
     // Sizes first, as any image that can be written can be read, however large.
     let (width, height) = reader().into_dimensions().map_err(unreadable)?;
     check_size(width.into(), height.into())?;
+    // As it is decoded, as floats, and as pixels.
+    crate::render::check_room((width, height), 30).map_err(|error| error.to_string())?;
     let mut reader = reader();
     reader.no_limits();
     let decoded = reader.decode().map_err(unreadable)?.into_rgb32f();

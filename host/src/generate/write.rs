@@ -1,6 +1,7 @@
 //! A scene as files: `scene.obj`, `scene.mtl`, `camera.json`.
 
 use crate::error::{Error, Result};
+use crate::output::MadeFolders;
 use crate::scene::{Camera, Material, Scene};
 use rayon::prelude::*;
 use std::collections::BTreeSet;
@@ -50,15 +51,9 @@ pub fn overwrite_unless(scene: &Scene, folder: &Path, stop: &AtomicBool) -> Resu
     if fs::metadata(folder).is_ok_and(|there| !there.is_dir()) {
         return Err(not_a_folder(folder));
     }
-    let is_new = !folder.exists();
-    fs::create_dir_all(folder).map_err(Error::io("creating", folder))?;
+    let _made = MadeFolders::make(folder)?;
     let drafted = drafts(scene, folder, stop);
     if stop.load(Ordering::Relaxed) {
-        drop(drafted);
-        if is_new {
-            // Something else may have come into it.
-            let _ = fs::remove_dir(folder);
-        }
         return Ok(false);
     }
     let drafts = drafted?;

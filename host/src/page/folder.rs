@@ -1,7 +1,7 @@
 //! The folder that a page and its data are written to.
 
 use crate::error::{Error, Result};
-use crate::output;
+use crate::output::{self, MadeFolders};
 use std::fs;
 use std::io::{ErrorKind, Read};
 use std::path::{Path, PathBuf};
@@ -18,7 +18,7 @@ const HEAD: u64 = 1024;
 #[derive(Debug)]
 pub struct Folder {
     path: PathBuf,
-    made: Vec<PathBuf>,
+    _made: MadeFolders,
 }
 
 impl Folder {
@@ -44,10 +44,7 @@ impl Folder {
                 ),
             ));
         }
-        let missing = |folder: &&Path| !folder.as_os_str().is_empty() && !folder.exists();
-        let made = path.ancestors().take_while(missing).map(Path::to_owned).collect();
-        let folder = Self { path: path.to_owned(), made };
-        fs::create_dir_all(path).map_err(Error::io("creating", path))?;
+        let folder = Self { path: path.to_owned(), _made: MadeFolders::make(path)? };
         for name in data.iter().chain([&INDEX]) {
             output::check_writable_bytes(path.join(name))?;
         }
@@ -62,17 +59,6 @@ impl Folder {
     /// Where a file of this name is.
     pub fn file(&self, name: &str) -> PathBuf {
         self.path.join(name)
-    }
-}
-
-impl Drop for Folder {
-    fn drop(&mut self) {
-        for folder in &self.made {
-            // Refused if there is anything in it, as there should be. One may not have come to be.
-            if fs::remove_dir(folder).is_err_and(|error| error.kind() != ErrorKind::NotFound) {
-                break;
-            }
-        }
     }
 }
 
