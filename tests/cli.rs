@@ -417,7 +417,10 @@ fn statistics_are_added_to_a_log() {
     let folder = tempfile::tempdir().expect("a folder");
     std::os::unix::fs::symlink("/dev/stdout", folder.path().join("link.json")).expect("a link");
     let log = folder.path().join("log.jsonl");
-    for to in ["/dev/stdout", "link.json", "/dev/stderr", "/dev/fd/1", "/proc/self/fd/1"] {
+    let of_ours = std::fs::File::create(&log).expect("a log");
+    let own = format!("/proc/{}/fd/{}", std::process::id(), std::os::fd::AsRawFd::as_raw_fd(&of_ours));
+    let others = if Path::new(&own).exists() { &[own.as_str(), "/proc/self/fd/1"][..] } else { &[] };
+    for to in [&["/dev/stdout", "link.json", "/dev/stderr", "/dev/fd/1"], others].concat() {
         std::fs::write(&log, "before\n").expect("a log");
         for _ in 0..2 {
             let open = || std::fs::OpenOptions::new().append(true).open(&log).expect("the log");
@@ -454,6 +457,30 @@ fn statistics_are_added_to_a_log() {
     }
 }
 
+#[cfg(unix)]
+#[test]
+fn streams_are_checked_before_anything_is_rendered() {
+    let folder = tempfile::tempdir().expect("a folder");
+    let plates = scene("plates");
+    copied("plates", &folder.path().join("plates"));
+    let file = folder.path().join("plates/scene.obj");
+    let before = std::fs::read(&file).expect("the scene");
+    for (scene, to, said) in [
+        (&plates, "/dev/fd/99", "writing /dev/fd/99"),
+        (&plates, "/dev/fd/x.json", "writing /dev/fd/x.json"),
+        (&"plates".to_owned(), "/dev/stdout", "which is read"),
+    ] {
+        let stdout = std::fs::OpenOptions::new().append(true).open(&file).expect("the scene");
+        let args = ["render", scene, "-o", "a.pfm", "--size", "8x8", "--spp", "1", "--stats", to];
+        let run = Command::new(PROGRAM).args(args).current_dir(folder.path()).stdout(stdout).output();
+        let done = run.expect("it starts");
+        assert_eq!(done.status.code(), Some(2), "{to}");
+        assert!(text(&done.stderr).contains(said), "{to}: {}", text(&done.stderr));
+        assert!(!folder.path().join("a.pfm").exists());
+    }
+    assert_eq!(std::fs::read(&file).expect("the scene"), before);
+}
+
 #[test]
 fn references_are_looked_at_before_anything_is_rendered() {
     let folder = tempfile::tempdir().expect("a folder");
@@ -473,16 +500,17 @@ fn references_are_looked_at_before_anything_is_rendered() {
 }
 
 #[test]
-fn a_target_before_the_scene_is_looked_at_from_behind_it() {
+fn a_target_before_the_scene_is_looked_at_from_somewhere() {
     let folder = tempfile::tempdir().expect("a folder");
     std::fs::copy(Path::new(&scene("plates")).join("scene.obj"), folder.path().join("scene.obj"))
         .expect("a scene");
     std::fs::copy(Path::new(&scene("plates")).join("scene.mtl"), folder.path().join("scene.mtl"))
         .expect("colours");
-    let args =
-        ["render", "scene.obj", "-o", "a.pfm", "--size", "4x4", "--spp", "1", "--target", "600,450,1000"];
-    let done = occlude(&args, folder.path());
-    assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+    for target in ["600,450,1000", "6e7,4.5e7,1e8"] {
+        let args = ["render", "scene.obj", "-o", "a.pfm", "--size", "4x4", "--spp", "1", "--target", target];
+        let done = occlude(&args, folder.path());
+        assert_eq!(done.status.code(), Some(0), "{}", text(&done.stderr));
+    }
 }
 
 #[test]
@@ -531,9 +559,9 @@ fn interrupting_keeps_what_there_is() {
 #[test]
 fn interrupting_the_writing_of_a_scene_leaves_nothing() {
     let folder = tempfile::tempdir().expect("a folder");
-    let args = ["generate", "spheres", "--triangles", "10M", "-o", "big"];
+    let args = ["generate", "spheres", "--triangles", "10M", "-o", "very/big"];
     let mut child = Command::new(PROGRAM).args(args).current_dir(folder.path()).spawn().expect("it starts");
-    let big = folder.path().join("big");
+    let big = folder.path().join("very/big");
     while !big.exists() {
         assert!(child.try_wait().expect("its state").is_none(), "it ended before it wrote");
         std::thread::sleep(std::time::Duration::from_millis(2));
@@ -542,7 +570,7 @@ fn interrupting_the_writing_of_a_scene_leaves_nothing() {
     assert!(killed.success());
     let status = child.wait().expect("it ends");
     assert_eq!(status.code(), Some(1));
-    assert!(!big.exists(), "{:?}", std::fs::read_dir(&big).map(Iterator::count));
+    assert_eq!(std::fs::read_dir(folder.path()).expect("the folder").count(), 0);
 }
 
 /// What an earlier run wrote is better than nothing.

@@ -240,9 +240,11 @@ fn compare(
 ) -> Result<Reproduced, Halted> {
     let began = Instant::now();
     let size = comparison.size;
-    // The reference and every method have a film and pictures; and one is being rendered or shown.
+    // The reference and every method have a film and pictures, most of them of the first passes; and some are shown.
     let image = size_of::<[f32; 3]>();
-    let films = (comparison.methods.len() + 1) * (Film::BYTES_A_PIXEL[0] + 2 * image);
+    let pictures = comparison.passes.min(ALL_UNTIL) as usize + 1;
+    let films = (comparison.methods.len() + 1) * (Film::BYTES_A_PIXEL[0] + image)
+        + comparison.methods.len() * pictures * image;
     check_room(size, films + 6 * image)?;
     let prepared = {
         let start = clock::of_process();

@@ -1,6 +1,6 @@
 //! `occlude generate`: a scene of any size, for measuring.
 
-use super::{Ended, interruptible, number, whole};
+use super::{Ended, interruptible, note, number, whole};
 use crate::error::Result;
 use crate::generate::{self, Kind, MOST_TRIANGLES};
 use std::io::{self, Write};
@@ -36,6 +36,7 @@ pub fn run(args: &GenerateArgs) -> Result<Ended> {
     check()?;
     // Before that there is nothing to clean up.
     if !generate::overwrite_unless(&scene, &folder, &interruptible("room on the disk"))? {
+        note("interrupted; nothing was written");
         return Ok(Ended::Interrupted);
     }
     // Whoever closed the pipe does not want to read this.

@@ -69,7 +69,7 @@ fn simd_level(name: &str) -> std::result::Result<SimdLevel, String> {
 pub enum Ended {
     /// As asked.
     Done,
-    /// By Ctrl-C; what there was, if a pass was done, has been written.
+    /// By Ctrl-C; of a picture, what there was, if a pass was done, has been written.
     Interrupted,
 }
 

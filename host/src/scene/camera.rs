@@ -67,6 +67,8 @@ impl Camera {
             let size = (hi - lo).length();
             distance = if size > 0.0 { size } else { 1.0 };
         }
+        // Or rounding would put it on the target.
+        let distance = distance.max(target.abs().max_element() * 1e-6);
         (target - forward * (distance * 1.05)).as_vec3()
     }
 
