@@ -225,23 +225,16 @@ enum Stream {
 
 impl Stream {
     fn named(path: &Path) -> Option<Self> {
-        let path = path.to_str()?;
-        let number = match path {
-            "/dev/stdout" => "1",
-            "/dev/stderr" => "2",
-            _ => {
-                let own = ["/dev/fd/", "/proc/self/fd/"].into_iter().find_map(|at| path.strip_prefix(at));
-                let of_any = || path.strip_prefix("/proc/")?.split_once("/fd/").map(|(_, number)| number);
-                let number = own.or_else(of_any)?;
-                number.parse::<u32>().ok()?;
-                if own.is_some() { number } else { "" }
+        match path.to_str()? {
+            "/dev/stdout" | "/dev/fd/1" | "/proc/self/fd/1" => Some(Self::Stdout),
+            "/dev/stderr" | "/dev/fd/2" | "/proc/self/fd/2" => Some(Self::Stderr),
+            path => {
+                let of_a_program =
+                    || path.strip_prefix("/proc/")?.split_once("/fd/").map(|(_, number)| number);
+                let number = path.strip_prefix("/dev/fd/").or_else(of_a_program)?;
+                number.parse::<u32>().is_ok().then_some(Self::Other)
             }
-        };
-        Some(match number {
-            "1" => Self::Stdout,
-            "2" => Self::Stderr,
-            _ => Self::Other,
-        })
+        }
     }
 
     /// Could it be written to?
@@ -284,17 +277,18 @@ impl<'a> Destination<'a> {
         // By hand, because the link may point to a file that is yet to be made.
         let mut stream = Stream::named(&file);
         for _ in 0..40 {
-            let Ok(target) = fs::read_link(&file).map(|target| folder(&file).join(target)) else { break };
+            let Ok(target) = fs::read_link(&file) else { break };
             if stream.is_some() {
                 break;
             }
-            stream = Stream::named(&target);
-            if !is_special || stream.is_some() {
-                file = target;
-            }
+            file = folder(&file).join(target);
+            stream = Stream::named(&file);
         }
         if stream.is_some() {
             return Ok(Self { asked, file, existing: None, stream });
+        }
+        if is_special {
+            file = asked.to_owned();
         }
         let refuse = |why: String| Err(Error::Usage(format!("writing {}: {why}", asked.display())));
         if !is_special && file.is_symlink() {
