@@ -82,21 +82,18 @@ impl Sampler {
                 let known = GENERATORS.get(count).copied();
                 let generator = u64::from(known.unwrap_or_else(|| lattice_generator(count as u32)));
                 let shift = [self.word(), self.word()];
-                // i / n as a fraction of 2^32, without a division for each.
+                // i/n and i g/n as fractions of 2^64, without a division for each; what is whole drops out.
                 let step = u64::MAX / count.max(1) as u64;
-                let fraction = |i: u64| ((i * (step >> 16)) >> 16) as u32;
-                let mut across = 0;
-                points.extend((0..count as u64).map(|i| {
-                    let point = [
-                        unit(shift[0].wrapping_add(fraction(i))),
-                        unit(shift[1].wrapping_add(fraction(across))),
-                    ];
-                    across += generator;
-                    if across >= count as u64 {
-                        across -= count as u64;
+                let steps = [step, step.wrapping_mul(generator)];
+                let first = points.len();
+                points.resize(first + count, [0.0; 2]);
+                let mut at = [0u64; 2];
+                for point in &mut points[first..] {
+                    for k in 0..2 {
+                        point[k] = unit(shift[k].wrapping_add((at[k] >> 32) as u32));
+                        at[k] = at[k].wrapping_add(steps[k]);
                     }
-                    point
-                }));
+                }
             }
             Pattern::Sobol => {
                 let scramble = [self.word(), self.word()];
@@ -270,6 +267,24 @@ mod tests {
     fn the_lattice_of_a_fibonacci_number_is_the_fibonacci_lattice() {
         assert_eq!([13, 21, 34, 55].map(lattice_generator), [8, 13, 21, 34]);
         assert_eq!((grid(16), grid(12), grid(7), grid(8)), ((4, 4), (4, 3), (3, 2), (4, 2)));
+    }
+
+    #[test]
+    fn a_lattice_has_a_point_in_every_column_and_row() {
+        for count in [1usize, 2, 3, 7, 16, 64, 100, 1000, 65_536] {
+            let mut points = vec![[2.0, 2.0]];
+            let mut sampler = Sampler::new(5, 6, count as u32);
+            sampler.points(Pattern::Lattice, count, &mut points);
+            assert_eq!(points.remove(0), [2.0, 2.0], "appended");
+            let (first, generator) = (points[0], lattice_generator(count as u32) as usize);
+            for (i, point) in points.iter().enumerate() {
+                for (k, place) in [i, i * generator % count].into_iter().enumerate() {
+                    let off = f64::from(point[k]) - f64::from(first[k]) - place as f64 / count as f64;
+                    let off = off - off.round();
+                    assert!(off.abs() < 1e-6, "{count} {i}: {point:?} is off by {off}");
+                }
+            }
+        }
     }
 
     #[test]
