@@ -167,6 +167,22 @@ fn bins_cut_the_square_evenly() {
     }
     assert_eq!(bin([0.0, 0.0]), 0);
     assert_eq!(bin([1.0 - f32::EPSILON / 2.0; 2]), BINS - 1);
+    // The numbers around each border, and a sweep.
+    let floor = |x: f32| ((x * 8.0).floor() as usize).min(7);
+    for k in 0..=8 {
+        let border = k as f32 / 8.0;
+        for x in [border.next_down().max(0.0), border, border.next_up()] {
+            assert_eq!(bin([x, 0.0]), floor(x), "{x}");
+            assert_eq!(bin([0.0, x]), 8 * floor(x), "{x}");
+        }
+    }
+    for k in 0..100_000 {
+        let x = k as f32 / 100_000.0;
+        assert_eq!(bin([x, 1.0 - x]), floor(x) + 8 * floor(1.0 - x), "{x}");
+    }
+    for odd in [-1.0, 2.0, f32::INFINITY, f32::NEG_INFINITY, f32::NAN] {
+        assert!(bin([odd, odd]) < BINS, "{odd}");
+    }
     for k in 0..CLASSES {
         // 4 p (1 - p) = 1.5 · 2^-(k + 1), in the middle of a class.
         let p = 0.5 - 0.5 * (1.0 - 0.75 * 0.5f32.powi(k as i32)).sqrt();

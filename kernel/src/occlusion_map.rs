@@ -41,11 +41,19 @@ pub const BINS: usize = BIN_EDGE * BIN_EDGE;
 /// is more than this many times what it would be.
 pub const LEAST_CHANCE: u32 = 32;
 
+/// From here to twice as much, the last bit of a number is worth one.
+const UNIT: f32 = 8_388_608.0;
+
 /// The bin of a light's point by its coordinates on the unit square, as light samples have them.
 #[inline]
 pub fn bin([s, t]: [f32; 2]) -> usize {
-    let at = |x: f32| ((x * BIN_EDGE as f32) as usize).min(BIN_EDGE - 1);
-    at(t) * BIN_EDGE + at(s)
+    // No conversion to whole numbers: of those that saturate the compiler makes no vectors.
+    let at = |x: f32| {
+        let within = (x * BIN_EDGE as f32).clamp(0.0, BIN_EDGE as f32 - 1.0);
+        let near = (within + UNIT) - UNIT;
+        if near > within { near - 1.0 } else { near }
+    };
+    (at(t) * BIN_EDGE as f32 + at(s) + UNIT).to_bits() as usize & (BINS - 1)
 }
 
 /// Which cell: a cube of the grid of its size, the side that surfaces face there, and the light.
