@@ -454,6 +454,8 @@ struct Fan {
     targets: [Vec<f32>; 3],
     /// 0 for one that sends nothing there.
     weights: Vec<f32>,
+    /// Whether all of them send something.
+    every: bool,
     /// Which part of the light they lie in.
     bins: Vec<u8>,
     /// How many times as likely as with an even density, if they follow another.
@@ -484,7 +486,7 @@ impl Fan {
 
     /// The bins of the samples that send something.
     fn append_bins_to(&self, bins: &mut Vec<u8>) {
-        if self.weights.iter().all(|&weight| weight > 0.0) {
+        if self.every {
             return bins.extend_from_slice(&self.bins);
         }
         bins.extend(self.bins.iter().zip(&self.weights).filter(|(_, w)| **w > 0.0).map(|(bin, _)| bin));
@@ -492,15 +494,14 @@ impl Fan {
 
     /// The samples that send something.
     fn append_to(&self, questions: &mut Questions) {
-        let all = self.weights.iter().all(|&weight| weight > 0.0);
-        for (to, from) in questions.targets.iter_mut().zip(&self.targets) {
-            if all {
+        let to = questions.targets.iter_mut().chain([&mut questions.weights]);
+        for (to, from) in to.zip(self.targets.iter().chain([&self.weights])) {
+            if self.every {
                 to.extend_from_slice(from);
             } else {
                 to.extend(from.iter().zip(&self.weights).filter(|(_, w)| **w > 0.0).map(|(at, _)| at));
             }
         }
-        questions.weights.extend(self.weights.iter().filter(|weight| **weight > 0.0));
     }
 }
 
@@ -527,7 +528,11 @@ impl Task for Open<'_> {
         let bins = &mut fan.bins[..count];
         // Cosines, inverse square, the density of a point, and the reflection of a diffuse surface.
         let scale = area.area * FRAC_1_PI * each;
-        let whole = area.shape == crate::light::Shape::Parallelogram;
+        // What stays the same is copied, and nothing is skipped: a vector would gather what only some of its lanes need.
+        let &AreaLight { corner, u, v, normal, shape, .. } = area;
+        let (from, up) = (point.x, point.normal);
+        let whole = shape == crate::light::Shape::Parallelogram;
+        let mut every = true;
         let mut i = 0;
         while i < count {
             let [mut s, mut t] = square[i];
@@ -536,19 +541,22 @@ impl Task for Open<'_> {
                 let root = s.sqrt();
                 (s, t) = (1.0 - root, t * root);
             }
-            let at = area.corner + area.u * s + area.v * t;
-            let path = at - point.x;
-            let squared = path.length_squared();
-            let (leaving, arriving) = (-area.normal.dot(path), point.normal.dot(path));
-            let arrives = leaving > 0.0 && arriving > 0.0;
-            let weight = leaving / squared * (arriving / squared) * scale;
-            weights[i] = if arrives { weight } else { 0.0 };
-            let target = at + area.normal * clearance;
+            let at = corner + u * s + v * t;
+            let path = at - from;
+            let one = 1.0 / path.length_squared();
+            let (leaving, arriving) = (-normal.dot(path), up.dot(path));
+            let arrives = (leaving > 0.0) & (arriving > 0.0);
+            let weight = (leaving * one) * (arriving * one) * scale;
+            let weight = if arrives { weight } else { 0.0 };
+            every &= weight > 0.0;
+            weights[i] = weight;
+            let target = at + normal * clearance;
             x[i] = target.x;
             y[i] = target.y;
             z[i] = target.z;
             i += 1;
         }
+        fan.every = every;
     }
 }
 
@@ -574,6 +582,32 @@ fn sample_lights(stage: &Stage<'_>, scratch: &mut Scratch) {
     }
 }
 
+/// Sums over pairs of numbers; in eight parts, so that vectors can take them and the order does not depend on the machine.
+#[inline(always)]
+fn sums<const N: usize>(
+    weights: &[f32],
+    estimates: &[f32],
+    terms: impl Fn(f32, f32) -> [f32; N],
+) -> [f32; N] {
+    let mut parts = [[0.0f32; 8]; N];
+    let (mut w, mut v) = (weights.chunks_exact(8), estimates.chunks_exact(8));
+    for (w, v) in w.by_ref().zip(v.by_ref()) {
+        for lane in 0..8 {
+            let terms = terms(w[lane], v[lane]);
+            for k in 0..N {
+                parts[k][lane] += terms[k];
+            }
+        }
+    }
+    for (lane, (w, v)) in w.remainder().iter().zip(v.remainder()).enumerate() {
+        let terms = terms(*w, *v);
+        for k in 0..N {
+            parts[k][lane] += terms[k];
+        }
+    }
+    parts.map(|x| ((x[0] + x[4]) + (x[1] + x[5])) + ((x[2] + x[6]) + (x[3] + x[7])))
+}
+
 fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
     let Scratch { questions, estimates, radiance, paths, .. } = scratch;
     let listens = film.listens();
@@ -583,17 +617,12 @@ fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
         let full = point.diffuse * stage.lights[batch.light as usize].radiance;
         let (weights, estimates) = (&questions.weights[samples.clone()], &estimates[samples]);
         if !listens {
-            let arrives: f32 = weights.iter().zip(estimates).map(|(w, v)| w * v).sum();
+            let [arrives] = sums(weights, estimates, |w, v| [w * v]);
             radiance[point.path as usize] += full * arrives;
             continue;
         }
-        let [mut all, mut arrives, mut visible, mut squares] = [0.0f32; 4];
-        for (w, v) in weights.iter().zip(estimates) {
-            all += w;
-            arrives += w * v;
-            visible += w * v * v;
-            squares += (w * v) * (w * v);
-        }
+        let moments = |w: f32, v: f32| [w, w * v, w * v * v, (w * v) * (w * v)];
+        let [all, arrives, visible, squares] = sums(weights, estimates, moments);
         radiance[point.path as usize] += full * arrives;
         // Where the form of the light has been taken out, only what is in the way differs from sample to sample.
         let n = weights.len() as f32;
