@@ -402,9 +402,12 @@ pub fn thread_time() -> f64 {
     time.tv_sec as f64 + time.tv_nsec as f64 * 1e-9
 }
 
-/// How often a tree is built to say how long that takes.
+/// How often a tree is built to say how long that takes: small ones take so little that other work often comes between.
 pub fn builds(scene: &Scene) -> usize {
-    if scene.triangles.len() > 2_000_000 { 1 } else { 3 }
+    match scene.triangles.len() {
+        n if n > 2_000_000 => 1,
+        n => (1_000_000 / n.max(1)).clamp(3, 25),
+    }
 }
 
 /// The middle one; of two middle ones their mean. NaN of nothing.
