@@ -505,6 +505,32 @@ impl Fan {
     }
 }
 
+/// How a light and a surface face each other: what a place on the light sends.
+#[derive(Clone, Copy)]
+struct Facing {
+    light: Vec3,
+    surface: Vec3,
+    /// The density of a place, and the reflection of a diffuse surface.
+    scale: f32,
+}
+
+impl Facing {
+    #[inline(always)]
+    fn new(area: &AreaLight, point: &ShadingPoint, each: f32) -> Self {
+        Self { light: area.normal, surface: point.normal, scale: area.area * FRAC_1_PI * each }
+    }
+
+    /// Cosines and inverse square along the way to a place of the light; 0 if it sends nothing there. Without a branch.
+    #[inline(always)]
+    fn weight(&self, path: Vec3) -> f32 {
+        let one = 1.0 / path.length_squared();
+        let (leaving, arriving) = (-self.light.dot(path), self.surface.dot(path));
+        let arrives = (leaving > 0.0) & (arriving > 0.0);
+        let weight = (leaving * one) * (arriving * one) * self.scale;
+        if arrives { weight } else { 0.0 }
+    }
+}
+
 /// Loops over plain slices, for the compiler to turn into vectors of the level.
 struct Open<'a> {
     fan: &'a mut Fan,
@@ -526,11 +552,10 @@ impl Task for Open<'_> {
         let (x, y, z) = (&mut x[..count], &mut y[..count], &mut z[..count]);
         let weights = &mut fan.weights[..count];
         let bins = &mut fan.bins[..count];
-        // Cosines, inverse square, the density of a point, and the reflection of a diffuse surface.
-        let scale = area.area * FRAC_1_PI * each;
-        // What stays the same is copied, and nothing is skipped: a vector would gather what only some of its lanes need.
+        let facing = Facing::new(area, point, each);
+        // What stays the same is copied: a vector would gather what only some of its lanes need.
         let &AreaLight { corner, u, v, normal, shape, .. } = area;
-        let (from, up) = (point.x, point.normal);
+        let from = point.x;
         let whole = shape == crate::light::Shape::Parallelogram;
         let mut every = true;
         let mut i = 0;
@@ -542,12 +567,7 @@ impl Task for Open<'_> {
                 (s, t) = (1.0 - root, t * root);
             }
             let at = corner + u * s + v * t;
-            let path = at - from;
-            let one = 1.0 / path.length_squared();
-            let (leaving, arriving) = (-normal.dot(path), up.dot(path));
-            let arrives = (leaving > 0.0) & (arriving > 0.0);
-            let weight = (leaving * one) * (arriving * one) * scale;
-            let weight = if arrives { weight } else { 0.0 };
+            let weight = facing.weight(at - from);
             every &= weight > 0.0;
             weights[i] = weight;
             let target = at + normal * clearance;

@@ -1,11 +1,10 @@
 //! Samples of a light that follow what a cell knows of it.
 
-use super::super::{Fan, Open, ShadingPoint};
+use super::super::{Facing, Fan, Open, ShadingPoint};
 use crate::light::{AreaLight, Shape};
 use occlude_kernel::Simd;
 use occlude_kernel::lanes::Task;
 use occlude_kernel::occlusion_map::{BIN_EDGE, BINS, Drawn, MapCell};
-use std::f32::consts::FRAC_1_PI;
 
 /// Corners of the bins of a light.
 const CORNER_EDGE: usize = BIN_EDGE + 1;
@@ -13,8 +12,8 @@ const CORNER_EDGE: usize = BIN_EDGE + 1;
 /// What the corners of the bins would send to a point if they were the whole light.
 #[inline(always)]
 fn corners(area: &AreaLight, point: &ShadingPoint) -> [f32; CORNER_EDGE * CORNER_EDGE] {
+    let facing = Facing::new(area, point, 1.0);
     let whole = area.shape == Shape::Parallelogram;
-    let scale = area.area * FRAC_1_PI;
     let mut grid = [0.0; CORNER_EDGE * CORNER_EDGE];
     let mut column = 0;
     while column < CORNER_EDGE {
@@ -26,14 +25,16 @@ fn corners(area: &AreaLight, point: &ShadingPoint) -> [f32; CORNER_EDGE * CORNER
             (area.corner + area.u * (1.0 - root), area.v * root)
         };
         let (from, step) = (start - point.x, step * (1.0 / BIN_EDGE as f32));
+        // As many as vectors hold, though the last ones are not wanted.
+        let mut weights = [0.0; 16];
         let mut row = 0;
+        while row < weights.len() {
+            weights[row] = facing.weight(from + step * row as f32);
+            row += 1;
+        }
+        row = 0;
         while row < CORNER_EDGE {
-            let path = from + step * row as f32;
-            let squared = path.length_squared();
-            let (leaving, arriving) = (-area.normal.dot(path), point.normal.dot(path));
-            let arrives = leaving > 0.0 && arriving > 0.0;
-            let weight = leaving / squared * (arriving / squared) * scale;
-            grid[row * CORNER_EDGE + column] = if arrives { weight } else { 0.0 };
+            grid[row * CORNER_EDGE + column] = weights[row];
             row += 1;
         }
         column += 1;
