@@ -43,7 +43,7 @@ use self::saved::SavedCell;
 use self::seed::Photons;
 use super::{
     Batch, CameraSample, NOBODY, Questions, Scratch, Share, Stage, Visibility, cast, exact, expect, round,
-    sample_lights,
+    sample_lights, sums,
 };
 use crate::film::Tile;
 use crate::photons::{BlockerSet, Shower};
@@ -407,7 +407,7 @@ impl Map {
         for batch in questions.batches.iter().filter(|batch| (batch.light as usize) < lights) {
             let samples = batch.samples.start as usize..batch.samples.end as usize;
             let estimates = &estimates[samples.clone()];
-            let [all, free] = past::sums(&questions.weights[samples], estimates);
+            let [all, free] = sums(&questions.weights[samples], estimates, |w, v| [w, w * v]);
             let pixel = questions.points[batch.point as usize].pixel as usize;
             if let Some(past) = pasts.get_mut(pixel * lights + batch.light as usize) {
                 let v = (free / all).min(1.0);

@@ -657,3 +657,19 @@ fn shade(stage: &Stage<'_>, film: &mut TileFilm, scratch: &mut Scratch) {
         film.add(path.pixel as usize, radiance);
     }
 }
+
+#[cfg(test)]
+mod tests {
+    use super::*;
+
+    #[test]
+    fn sums_are_over_all_samples() {
+        for count in 0..40 {
+            let weights: Vec<f32> = (0..count).map(|k| k as f32).collect();
+            let estimates: Vec<f32> = (0..count).map(|k| (k % 2) as f32).collect();
+            let all = weights.iter().sum::<f32>();
+            let free = weights.iter().zip(&estimates).map(|(w, v)| w * v).sum::<f32>();
+            assert_eq!(sums(&weights, &estimates, |w, v| [w, w * v]), [all, free], "{count}");
+        }
+    }
+}

@@ -1,9 +1,8 @@
 //! What the rays of a tile saw: counted for their cells, remembered for their pixels, and what that says of the gain.
 
 use super::kinds;
-use super::past;
 use super::{Map, NOBODY, TilePast, past_of};
-use crate::integrator::{Batch, Questions, Stage};
+use crate::integrator::{Batch, Questions, Stage, sums};
 use occlude_kernel::Simd;
 use occlude_kernel::lanes::Task;
 use occlude_kernel::occlusion_map::{BINS, Doubts, Tally};
@@ -46,15 +45,25 @@ impl Gain<f64> {
     }
 
     /// Adds what its quarters saw, where all of it has the variance `whole`.
+    #[inline(always)]
     fn add_quarters(&mut self, light: f32, whole: f32, bins: &[u8], estimates: &[f32]) {
-        // Sixteen bits for each quarter: so many samples are enough.
-        let (mut asked, mut free) = (0u64, 0u64);
-        for (&bin, &estimate) in bins.iter().zip(estimates).take(usize::from(u16::MAX)) {
-            let quarter = 1u64 << (bin & 32 | bin << 2 & 16);
-            asked += quarter;
-            free += if estimate > 0.0 { quarter } else { 0 };
+        let (mut asked, mut free) = ([0.0f32; 4], [0.0f32; 4]);
+        // Eight bits for each quarter, so that vectors hold as many samples as of numbers.
+        const MOST: usize = u8::MAX as usize;
+        for (bins, estimates) in bins.chunks(MOST).zip(estimates.chunks(MOST)) {
+            let mut words = [0u32; 2];
+            for (&bin, &estimate) in bins.iter().zip(estimates) {
+                let bin = u32::from(bin);
+                let quarter = 1u32 << (bin >> 1 & 16 | bin << 1 & 8);
+                words[0] += quarter;
+                words[1] += if estimate > 0.0 { quarter } else { 0 };
+            }
+            for (sums, word) in [&mut asked, &mut free].into_iter().zip(words) {
+                for (k, sum) in sums.iter_mut().enumerate() {
+                    *sum += (word >> (8 * k) & 0xff) as f32;
+                }
+            }
         }
-        let [asked, free] = [asked, free].map(|sums| [0, 16, 32, 48].map(|at| (sums >> at & 0xffff) as f32));
         let (mut sum, mut samples) = (0.0, 0.0);
         for (n, free) in asked.into_iter().zip(free).filter(|(n, _)| *n > 1.0) {
             sum += n * (free / n) * (1.0 - free / n) * (n / (n - 1.0));
@@ -202,7 +211,7 @@ impl Task for Hear<'_, '_> {
     fn run<S: Simd>(self, _simd: S) -> Heard {
         let Self { map, stage, questions, estimates, pasts } = self;
         let doubts = map.tell(&questions.batches, &questions.cells, &questions.bins, estimates);
-        let mut sums = Gain::<f64>::default();
+        let mut gain = Gain::<f64>::default();
         let mut seen = kinds::Seen::default();
         let told = questions.wholes.iter().zip(&questions.usual).zip(&questions.before).zip(&questions.kinds);
         for (batch, (((&whole, &usual), &before), &kind)) in questions.batches.iter().zip(told) {
@@ -214,7 +223,7 @@ impl Task for Hear<'_, '_> {
             let samples = batch.samples.start as usize..batch.samples.end as usize;
             let count = samples.len() as f32;
             let estimates = &mut estimates[samples.clone()];
-            let [all, free] = past::sums(&questions.weights[samples], estimates);
+            let [all, free] = sums(&questions.weights[samples], estimates, |w, v| [w, w * v]);
             let off = if whole.is_finite() { whole - all } else { 0.0 };
             let v = (free / all).min(1.0);
             let bins = &questions.bins[batch.samples.start as usize..batch.samples.end as usize];
@@ -226,9 +235,9 @@ impl Task for Hear<'_, '_> {
                 let radiance = stage.lights[batch.light as usize].radiance * (all / map.brightest);
                 let light = (point.diffuse * radiance).length_squared();
                 let form = |v: f32| (v * off / all).powi(2);
-                let whole = sums.add(light, v, [count, usual], [form(v), form(v - past.mean())]);
+                let whole = gain.add(light, v, [count, usual], [form(v), form(v - past.mean())]);
                 if whole > 0.0 && count >= QUARTERED && (batch.point + map.passes).is_multiple_of(4) {
-                    sums.add_quarters(light, whole, bins, estimates);
+                    gain.add_quarters(light, whole, bins, estimates);
                 }
             }
             let more = past.asked(v, off, before) / all;
@@ -236,7 +245,7 @@ impl Task for Hear<'_, '_> {
                 estimates.iter_mut().for_each(|estimate| *estimate += more);
             }
         }
-        Heard { doubts, kinds: seen, gain: sums.counted() }
+        Heard { doubts, kinds: seen, gain: gain.counted() }
     }
 }
 
@@ -312,6 +321,14 @@ mod tests {
         assert!((half - 0.7).abs() < 0.01 && border > 5.0 && border < 8.0, "{border} {half}");
         let (fine, all) = gain(|bin| (bin ^ bin >> 3) & 1 == 0);
         assert!((all - 1.05).abs() < 0.03 && (fine - 4.0).abs() < 1e-3, "{fine} {all}");
+        // More samples than are counted at a time: the same border, but for n / (n - 1).
+        let (bins, estimates) = (bins.repeat(10), bins.repeat(10));
+        let estimates: Vec<f32> = estimates.iter().map(|bin| f32::from(u8::from(bin % 8 < 2))).collect();
+        let mut sums = Gain::<f64>::default();
+        let whole = sums.add(1.0, 0.25, [640.0, 160.0], [0.0; 2]);
+        sums.add_quarters(1.0, whole, &bins, &estimates);
+        let half = sums.quarters / sums.whole;
+        assert!((half - 2.0 / 3.0 * (160.0 / 159.0) / (640.0 / 639.0)).abs() < 1e-5, "{half}");
         // What the light's form adds counts with either power, and nothing seen is nothing told.
         let mut sums = Gain::<f64>::default();
         sums.add(2.0, 0.0, [8.0, 8.0], [0.5, 0.25]);

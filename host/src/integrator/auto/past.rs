@@ -259,24 +259,6 @@ impl Nearby {
     }
 }
 
-/// The sum of the weights, and of those that arrive; in eight parts, so that the order does not depend on the machine.
-#[inline]
-pub(super) fn sums(weights: &[f32], estimates: &[f32]) -> [f32; 2] {
-    let (mut all, mut free) = ([0.0f32; 8], [0.0f32; 8]);
-    let (mut w, mut e) = (weights.chunks_exact(8), estimates.chunks_exact(8));
-    for (w, e) in w.by_ref().zip(e.by_ref()) {
-        for k in 0..8 {
-            all[k] += w[k];
-            free[k] += w[k] * e[k];
-        }
-    }
-    for (k, (w, e)) in w.remainder().iter().zip(e.remainder()).enumerate() {
-        all[k] += w;
-        free[k] += w * e;
-    }
-    [all, free].map(|x| ((x[0] + x[4]) + (x[1] + x[5])) + ((x[2] + x[6]) + (x[3] + x[7])))
-}
-
 #[cfg(test)]
 mod tests {
     use super::super::kinds::Seen;
@@ -395,17 +377,6 @@ mod tests {
         assert!(learned[0] < 0.3 && learned[1] < 0.3 && learned[2] > 0.99, "{learned:?}");
         assert_eq!(learned[3], usual[3]);
         assert!(near(&[Past::default(); 4], 0).doubt(&Variances::default()) == 1.0, "not asked yet");
-    }
-
-    #[test]
-    fn sums_are_over_all_samples() {
-        for count in 0..40 {
-            let weights: Vec<f32> = (0..count).map(|k| k as f32).collect();
-            let estimates: Vec<f32> = (0..count).map(|k| (k % 2) as f32).collect();
-            let all = weights.iter().sum::<f32>();
-            let free = weights.iter().zip(&estimates).map(|(w, e)| w * e).sum::<f32>();
-            assert_eq!(sums(&weights, &estimates), [all, free], "{count}");
-        }
     }
 
     #[test]
