@@ -133,6 +133,31 @@ struct Views<L> {
     corners: [Vec3x<L>; 4],
 }
 
+/// A triangle and its plane.
+struct Facet {
+    corners: [Vec3; 3],
+    normal: Vec3,
+    /// What the products of the normal are at most.
+    sizes: Vec3,
+    /// What rounding may do to how far any point or target is along the normal.
+    bound: f32,
+}
+
+impl Facet {
+    #[inline(always)]
+    fn new(flat: &Flat, block: &TriangleBlock, lane: usize) -> Self {
+        let [p, q, r] = block.get(lane);
+        let (p, q, r) = (Vec3::from(p), Vec3::from(q), Vec3::from(r));
+        let (e, f) = (q - p, r - p);
+        let normal = e.cross(f);
+        let (e, f) = (e.abs(), f.abs());
+        let sizes = Vec3::new(e.y * f.z + e.z * f.y, e.z * f.x + e.x * f.z, e.x * f.y + e.y * f.x);
+        let from = |v: Vec3| (v - flat.reference).abs().max_element();
+        let far = flat.near + from(p).max(from(q)).max(from(r)).max(flat.far);
+        Self { corners: [p, q, r], normal, sizes, bound: sizes.element_sum() * far * (8.0 * ROUNDING) }
+    }
+}
+
 impl<S: Simd> Bvh<'_, S> {
     /// Which targets of points, as many as a packet holds at most, the triangles of some blocks block. Gives the points
     /// that were answered, as bits; the others see the light too flat, or have too many targets.
@@ -231,7 +256,8 @@ impl<S: Simd> Bvh<'_, S> {
         if met.bits() & *open == 0 {
             return;
         }
-        let met = met & views.crosses(token, flat, block, lane, from_x);
+        let facet = Facet::new(flat, block, lane);
+        let met = met & views.crosses(token, flat, &facet, from_x);
         let met = met.bits() & *open;
         if met == 0 {
             return;
@@ -255,9 +281,11 @@ impl<S: Simd> Bvh<'_, S> {
             if all >> k & 1 != 0 {
                 abreast.blocked[k] = every;
             } else if known >> k & 1 == 0 {
+                // Seen edge on. Most often it is the surface that x lies on, and all that is asked about is above it.
+                let (first, count) = (first as usize, count as usize);
+                let ask = ask & self.beyond(&facet, x, targets, first, count);
                 counter.triangle_tests(ask.count_ones());
-                abreast.blocked[k] |=
-                    self.exact_of(x, targets, first as usize, count as usize, block, lane, ask);
+                abreast.blocked[k] |= self.exact_of(x, targets, first, count, block, lane, ask);
             } else {
                 if abreast.placed >> k & 1 == 0 {
                     abreast.placed |= 1 << k;
@@ -276,6 +304,31 @@ impl<S: Simd> Bvh<'_, S> {
                 *open &= !(1 << k);
             }
         }
+    }
+
+    /// Which targets of a point may be on the other side of a triangle's plane, as [`Views::crosses`] tells it of all.
+    #[inline(always)]
+    fn beyond(&self, facet: &Facet, x: [f32; 3], targets: &Targets<'_>, first: usize, count: usize) -> u64 {
+        let token = self.simd.token();
+        let [a, b, c] = facet.corners;
+        let x = Vec3::from(x);
+        let [a, b, c] = [a - x, b - x, c - x];
+        let plane = S::Packet::splat(token, facet.normal.dot(a));
+        let here = (facet.sizes * (8.0 * ROUNDING)).dot(a.abs().max(b.abs()).max(c.abs()));
+        let [low, high] = [S::Packet::splat(token, -here), S::Packet::splat(token, here)];
+        let bound = S::Packet::splat(token, facet.bound);
+        let origin = vec3x::splat::<S::Packet>(token, x.to_array());
+        let normal = vec3x::splat::<S::Packet>(token, facet.normal.to_array());
+        let mut bits = 0;
+        let mut i = 0;
+        while i < count {
+            let direction = vec3x::sub(targets_from::<S>(token, targets, first + i, first + count), origin);
+            let at = vec3x::dot(normal, direction);
+            let may = low.min(at - bound).le(plane) & plane.le(high.max(at + bound));
+            bits |= u64::from(may.bits()) << i;
+            i += S::Packet::WIDTH;
+        }
+        bits
     }
 
     /// The test of [`crate::triangle`], of the targets of `ask`.
@@ -416,24 +469,10 @@ impl<L: Lanes> Views<L> {
 
     /// Points that have some target on the other side of the triangle's plane. `from_x` are its vertices from x.
     #[inline(always)]
-    fn crosses(
-        &self,
-        token: L::Token,
-        flat: &Flat,
-        block: &TriangleBlock,
-        lane: usize,
-        from_x: [Vec3x<L>; 3],
-    ) -> L::Mask {
-        let [p, q, r] = block.get(lane);
-        let (p, q, r) = (Vec3::from(p), Vec3::from(q), Vec3::from(r));
-        let (e, f) = (q - p, r - p);
-        let normal = e.cross(f);
-        let (e, f) = (e.abs(), f.abs());
-        let sizes = Vec3::new(e.y * f.z + e.z * f.y, e.z * f.x + e.x * f.z, e.x * f.y + e.y * f.x);
-        let from = |v: Vec3| (v - flat.reference).abs().max_element();
-        let far = flat.near + from(p).max(from(q)).max(from(r)).max(flat.far);
+    fn crosses(&self, token: L::Token, flat: &Flat, facet: &Facet, from_x: [Vec3x<L>; 3]) -> L::Mask {
+        let &Facet { normal, sizes, bound, .. } = facet;
         let thick = 0.5 * (flat.greatest[2] - flat.least[2]) * normal.dot(flat.normal).abs();
-        let bound = L::splat(token, sizes.element_sum() * far * (8.0 * ROUNDING) + thick);
+        let bound = L::splat(token, bound + thick);
         let n = vec3x::splat::<L>(token, normal.to_array());
         let plane = vec3x::dot(n, from_x[0]);
         // Seen from x, it is x itself that is not rounded: triangles of the surface that x lies on do not come between.
