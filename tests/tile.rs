@@ -399,6 +399,77 @@ fn walls_at_the_corner_of_a_light() {
     assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
 }
 
+/// The plane of the surface that the points lie on passes through the light, and targets are on either side of it.
+#[test]
+fn lights_that_reach_below_the_surface() {
+    let mut random = Random::new(29);
+    let mut scratch = TileScratch::new();
+    let mut total = [0, 0];
+    for trial in 0..1500 {
+        let x = if trial % 3 == 0 { Vec3::X } else { random.direction() };
+        let (y, z) = x.any_orthonormal_pair();
+        let place = random.point() * random.any_scale(-1.0, 1.5);
+        let world = |[a, b, c]: [f32; 3]| x * a + y * b + z * c + place;
+        // A floor at height 0, whole or ending before the light, in two triangles or many, and some things on it.
+        let (far, pieces) = (random.between(1.2, 3.0), 1 + random.below(3));
+        let mut triangles = Vec::new();
+        for row in 0..pieces {
+            for column in 0..pieces {
+                let at = |row: usize, column: usize| {
+                    let [s, t] = [row, column].map(|k| k as f32 / pieces as f32);
+                    world([-1.0 + (far + 1.0) * s, 0.0, 2.0 * t - 1.0])
+                };
+                let [p, q] = [at(row, column), at(row, column + 1)];
+                let [r, s] = [at(row + 1, column + 1), at(row + 1, column)];
+                triangles.extend([[p, q, r], [p, r, s]]);
+            }
+        }
+        for _ in 0..random.below(4) {
+            let at = world([random.between(0.5, 1.5), random.between(-0.1, 0.3), random.between(-0.5, 0.5)]);
+            triangles.push([at, at + random.point() * 0.3, at + random.point() * 0.3]);
+        }
+        let accel = Accel::from_triangles(&triangles, Quality::Medium);
+        let clearance = accel.bvh().clearance();
+        let (low, high) = (-random.unit(), random.unit());
+        let (corner, u, v) = (world([2.0, low, -0.5]), y * (high - low), z);
+        let (mut points, mut ends) = (Vec::new(), Vec::new());
+        let (count, height) = (8 + random.below(57), [1.0, 1.0, 0.3, 0.0, -1.0][random.below(5)]);
+        for _ in 0..32 {
+            let at = world([random.between(-0.2, 0.2), clearance * height, random.between(-0.2, 0.2)]);
+            points.push(TilePoint { x: at.into(), first: ends.len() as u32, count: count as u32 });
+            ends.extend((0..count).map(|_| {
+                let above = match random.below(4) {
+                    // Some last bits beside the plane.
+                    0 => clearance * random.between(-2.0, 2.0),
+                    1 => random.between(low, high),
+                    _ => random.between(0.0, high),
+                };
+                // There is no telling in the plane, if the point is in it too.
+                let above = if height == 0.0 && above.abs() < 0.01 { above.signum() * 0.01 } else { above };
+                corner + y * (above - low) + v * random.unit()
+            }));
+        }
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+        for on in families(accel.bvh()) {
+            for targets in [any, any.on_parallelogram(corner, u, v)] {
+                let mut blocked = vec![0; ends.len().div_ceil(64)];
+                on.occluded_tile(&points, &targets, None, &mut Counts::default(), &mut scratch, &mut blocked);
+                for point in &points {
+                    for i in point.first as usize..(point.first + point.count) as usize {
+                        let ray = Ray::segment(point.x, ends[i]);
+                        let want = on.occluded(&ray, None, &mut Counts::default());
+                        let got = blocked[i / 64] >> (i % 64) & 1 != 0;
+                        assert_eq!(got, want, "{}: {ray:?}, {triangles:?}", on.family);
+                        total[usize::from(want)] += 1;
+                    }
+                }
+            }
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 100_000), "{total:?}");
+}
+
 #[test]
 fn a_target_that_is_no_number_is_free() {
     // A sheet hides all of the light, but nothing hides what is nowhere.
