@@ -451,18 +451,23 @@ fn lights_that_reach_below_the_surface() {
         }
         let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
         let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let rays = |point: &TilePoint| {
+            let (x, all) = (point.x, point.first as usize..(point.first + point.count) as usize);
+            all.map(|i| (i, Ray::segment(x, ends[i]))).collect::<Vec<_>>()
+        };
         for on in families(accel.bvh()) {
+            let want: Vec<bool> = points
+                .iter()
+                .flat_map(rays)
+                .map(|(_, ray)| on.occluded(&ray, None, &mut Counts::default()))
+                .collect();
+            want.iter().for_each(|&hit| total[usize::from(hit)] += 1);
             for targets in [any, any.on_parallelogram(corner, u, v)] {
                 let mut blocked = vec![0; ends.len().div_ceil(64)];
                 on.occluded_tile(&points, &targets, None, &mut Counts::default(), &mut scratch, &mut blocked);
-                for point in &points {
-                    for i in point.first as usize..(point.first + point.count) as usize {
-                        let ray = Ray::segment(point.x, ends[i]);
-                        let want = on.occluded(&ray, None, &mut Counts::default());
-                        let got = blocked[i / 64] >> (i % 64) & 1 != 0;
-                        assert_eq!(got, want, "{}: {ray:?}, {triangles:?}", on.family);
-                        total[usize::from(want)] += 1;
-                    }
+                for (i, ray) in points.iter().flat_map(rays) {
+                    let got = blocked[i / 64] >> (i % 64) & 1 != 0;
+                    assert_eq!(got, want[i], "{}: {ray:?}, {triangles:?}", on.family);
                 }
             }
         }

@@ -19,7 +19,7 @@
 //! rounding, in a line with the ray, can have three signs alike by chance, however far away it is: a hit must
 //! therefore also have the ray within the sheared vertices' box, which holds for every triangle that holds it.
 //! A segment that begins *in* the plane of a triangle, but for rounding, and ends there too may be said to meet it or not,
-//! and queries may differ about it: where a point stands off its surface ([`offset`](crate::offset)) there is no such one.
+//! and queries may differ about it. A point that stands off its surface ([`offset`](crate::offset)) is not in that one's plane.
 //!
 //! Where along the ray is another question, and asked only where a lane is inside: `t = n (a - o) / n d` with the
 //! normal n of the triangle's own edges, held between the t of the vertices.

@@ -510,7 +510,7 @@ impl Fan {
 struct Facing {
     light: Vec3,
     surface: Vec3,
-    /// The density of a place, and the reflection of a diffuse surface.
+    /// The density of a place, the reflection of a diffuse surface, and what a sample counts.
     scale: f32,
 }
 

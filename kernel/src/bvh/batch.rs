@@ -158,7 +158,8 @@ impl<S: Simd> Bvh<'_, S> {
     ///
     /// Bit `i % 64` of `blocked[i / 64]` answers for target `i`, as [`Bvh::occluded`] would for
     /// [`Ray::segment(x, target)`](crate::Ray::segment). Words are overwritten; bits beyond the targets are 0, and
-    /// words beyond the last target are left alone. Panics if `blocked` is too short for the targets.
+    /// words beyond the last target are left alone. Panics if `blocked` is too short for the targets. Of segments in the
+    /// plane of a triangle see [`crate::triangle`].
     ///
     /// One traversal for 64 targets. Say what light they lie on if it is flat ([`Targets::on_parallelogram`]).
     #[inline(always)]

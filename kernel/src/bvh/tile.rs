@@ -241,8 +241,8 @@ impl<S: Simd> Bvh<'_, S> {
     ///
     /// Bit `i % 64` of `blocked[i / 64]` answers for target `i`, as [`Bvh::occluded`] would for
     /// [`Ray::segment(x, target)`](crate::Ray::segment) with the point it belongs to; the bits of targets that
-    /// belong to no point are left alone. (Of segments in the plane of a triangle see [`crate::triangle`].) Panics if a point names targets that do not exist, or if `blocked` is
-    /// too short.
+    /// belong to no point are left alone. Panics if a point names targets that do not exist, or if `blocked` is
+    /// too short. Of segments in the plane of a triangle see [`crate::triangle`].
     ///
     /// Any points and any targets get right answers. It pays where the points are neighbours, such as those of 8
     /// by 8 pixels, also in their order (a Z curve is best), and the targets lie on one light.

@@ -322,13 +322,13 @@ mod tests {
         let (fine, all) = gain(|bin| (bin ^ bin >> 3) & 1 == 0);
         assert!((all - 1.05).abs() < 0.03 && (fine - 4.0).abs() < 1e-3, "{fine} {all}");
         // More samples than are counted at a time: the same border, but for n / (n - 1).
-        let (bins, estimates) = (bins.repeat(10), bins.repeat(10));
+        let (bins, estimates) = (bins.repeat(20), bins.repeat(20));
         let estimates: Vec<f32> = estimates.iter().map(|bin| f32::from(u8::from(bin % 8 < 2))).collect();
         let mut sums = Gain::<f64>::default();
-        let whole = sums.add(1.0, 0.25, [640.0, 160.0], [0.0; 2]);
+        let whole = sums.add(1.0, 0.25, [1280.0, 320.0], [0.0; 2]);
         sums.add_quarters(1.0, whole, &bins, &estimates);
         let half = sums.quarters / sums.whole;
-        assert!((half - 2.0 / 3.0 * (160.0 / 159.0) / (640.0 / 639.0)).abs() < 1e-5, "{half}");
+        assert!((half - 2.0 / 3.0 * (320.0 / 319.0) / (1280.0 / 1279.0)).abs() < 1e-5, "{half}");
         // What the light's form adds counts with either power, and nothing seen is nothing told.
         let mut sums = Gain::<f64>::default();
         sums.add(2.0, 0.0, [8.0, 8.0], [0.5, 0.25]);
