@@ -283,7 +283,8 @@ impl Record {
         }
         text.push_str(
             "\n## Trees\n\nBytes a triangle: ours with the triangles in it, Embree's without the vertex and index buffers that it \
-             is given (its leaves hold vertices too). Build times on all cores, the least of up to 25, the fewer the larger, Embree's at high quality.\n\n\
+             is given (its leaves hold vertices too). Build times on all cores, the least of up to 25, the fewer the larger, \
+             Embree's at high quality.\n\n\
              | scene | triangles | points | lit / dark / penumbra, % | ours, B | Embree fast, B | robust, B | ours, s | Embree \
              fast, s | robust, s |\n| --- | ---: | ---: | --- | ---: | ---: | ---: | ---: | ---: | ---: |\n",
         );

@@ -22,6 +22,10 @@ pub use dispatched::Dispatched16;
 #[cfg(feature = "dispatch")]
 pub use dispatched::{Dispatched, Level, Task, detect, dispatch, level_name, level_named, levels};
 
+/// From here to twice as much, the last bit of a number is worth one: what is added to it is rounded to whole numbers, without
+/// a conversion.
+pub(crate) const UNIT: f32 = 8_388_608.0;
+
 /// One bool for each lane.
 pub trait Mask: Copy + Debug + BitAnd<Output = Self> + BitOr<Output = Self> + BitXor<Output = Self> {
     /// The lanes as bits, lane 0 in the lowest.

@@ -26,6 +26,7 @@
 //! Nothing here is written while it is read, and no number is drawn: the caller collects what rays saw in [`Tally`]s,
 //! and makes new odds of them ([`MapCell::learn`]) between passes.
 
+use crate::lanes::UNIT;
 use bytemuck::{Pod, Zeroable};
 use core::fmt;
 use glam::Vec3;
@@ -40,9 +41,6 @@ pub const BINS: usize = BIN_EDGE * BIN_EDGE;
 /// No part of a light gets fewer samples than one in this many of those it would get without a map, so that no weight
 /// is more than this many times what it would be.
 pub const LEAST_CHANCE: u32 = 32;
-
-/// From here to twice as much, the last bit of a number is worth one.
-const UNIT: f32 = 8_388_608.0;
 
 /// The bin of a light's point by its coordinates on the unit square, as light samples have them.
 #[inline]

@@ -262,8 +262,7 @@ fn extent_squared(turned: &Turned) -> f32 {
 #[cfg(test)]
 mod tests {
     use super::*;
-    use crate::bvh::grid::UNIT;
-    use crate::lanes::{Native, Scalar};
+    use crate::lanes::{Native, Scalar, UNIT};
     use glam::Vec3;
 
     #[test]

@@ -4,7 +4,7 @@ use super::Targets;
 use super::batch::targets_from;
 use super::pyramid::MOST;
 use super::shaft::Shaft;
-use crate::lanes::{Lanes, Simd};
+use crate::lanes::{Lanes, Simd, UNIT};
 use crate::vec3x;
 use glam::Vec3;
 
@@ -91,9 +91,6 @@ impl Grid {
         }
     }
 }
-
-/// From here to twice as much, the last bit of a number is worth one.
-pub(super) const UNIT: f32 = 8_388_608.0;
 
 /// The cell that a number stands for; any, where it is not finite.
 #[inline(always)]
