@@ -54,6 +54,8 @@ pub struct TileScratch {
     sheet: Option<Place>,
     /// For how many tiles with long lists to come these are not asked.
     thick: u32,
+    /// For how many tiles to come, where more is in the way than fits a list, they are not asked about part by part.
+    coarse: u32,
     beams: Beams,
     umbra: Umbra,
 }
@@ -72,6 +74,7 @@ impl TileScratch {
             inner: List::EMPTY,
             sheet: None,
             thick: 0,
+            coarse: 0,
             beams: Beams::NOTHING,
             umbra: Umbra::NOTHING,
         }
@@ -215,6 +218,9 @@ const PART: usize = 16;
 const SHORT: usize = 12;
 const TRIED: usize = 2;
 
+/// For so many tiles after one where they gain nothing, parts are not tried.
+const COARSE: u32 = 7;
+
 /// With fewer samples a point, a list that is longer is asked for some points, and for the others only if no more of its
 /// triangles than this come before the targets of a point: else going down the tree is quicker.
 const LONG: usize = 16;
@@ -315,6 +321,7 @@ impl<S: Simd> Bvh<'_, S> {
             inner,
             sheet,
             thick,
+            coarse,
             beams,
             umbra,
         } = scratch;
@@ -360,7 +367,11 @@ impl<S: Simd> Bvh<'_, S> {
             // A list that is not all there is would be asked for nothing as often as not.
             given.count = 0;
         }
-        let parts = complete || !beams.instead_of_parts();
+        let mut parts = complete || !beams.instead_of_parts();
+        if parts && !complete && fine {
+            parts = *coarse == 0;
+            *coarse = coarse.saturating_sub(1);
+        }
         let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls, beams };
         let apart = fine && parts && points.len() > PART && !(complete && given.count <= SHORT);
         let Some(whole) = shaft.as_ref().filter(|_| apart) else {
@@ -393,6 +404,7 @@ impl<S: Simd> Bvh<'_, S> {
         while k < points.len() {
             if !complete && tried == TRIED && useful == 0 {
                 let rest = &points[k..];
+                *coarse = COARSE;
                 self.ask_points(None, false, rest, targets, cut, given, ignore, counter, work, blocked);
                 return;
             }
