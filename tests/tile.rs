@@ -3,7 +3,7 @@
 
 use glam::Vec3;
 use occlude_host::accel::{Accel, Quality};
-use occlude_kernel::{Counts, Ray, Targets, TilePoint, TileScratch, offset};
+use occlude_kernel::{BatchScratch, Counts, Ray, Targets, TilePoint, TileScratch, offset};
 use occlude_tests::{Family, On, Random, families};
 
 type Triangle = [Vec3; 3];
@@ -332,6 +332,101 @@ fn lights_whose_edges_are_all_but_parallel() {
         }
     }
     assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
+}
+
+/// Segments that pass within some last bits of the edges of triangles, near to the points and far from them, and of their
+/// planes where the light is: what is told from them by linear forms must be told as by a single ray.
+#[test]
+fn targets_beside_the_edges_of_triangles() {
+    let mut random = Random::new(91);
+    let mut scratch = TileScratch::new();
+    let mut batch = BatchScratch::new();
+    let mut total = [0, 0];
+    for _ in 0..4000 {
+        let away = random.direction() * random.any_scale(-1.0, 1.0);
+        let (a, b) = away.normalize().any_orthonormal_pair();
+        let size = away.length() * random.any_scale(-1.5, 0.3);
+        let light = Light {
+            corner: away - (a + b) * (0.5 * size),
+            u: (a + random.point() * 0.3) * size,
+            v: (b + random.point() * 0.3) * size,
+        };
+        let normal = light.u.cross(light.v).as_dvec3();
+        // What the error is in proportion to: the triangle, or all of the scene, where the points are.
+        let place = random.direction() * random.any_scale(-2.0, 2.0);
+        let mut triangles = Vec::new();
+        for _ in 0..1 + random.below(6) {
+            let t = if random.below(4) == 0 { random.between(0.9, 1.1) } else { random.between(0.05, 1.0) };
+            let middle = away * t + random.point() * (0.5 * t * size);
+            let wide = t * size * random.any_scale(-1.0, 1.0);
+            let thin = random.any_scale(-3.0, 0.0);
+            let (p, q) = (middle + random.point() * wide, middle + random.point() * wide);
+            triangles.push([p, q, p.lerp(q, random.unit()) + random.point() * (wide * thin)]);
+        }
+        let near = triangles.len();
+        if random.below(2) == 0 {
+            let far = -away.normalize() * random.any_scale(1.0, 4.0);
+            triangles.push([far, far + Vec3::X, far + Vec3::Y]);
+        }
+        triangles.iter_mut().flatten().for_each(|vertex| *vertex += place);
+        let (mut points, mut ends) = (Vec::new(), Vec::new());
+        for _ in 0..16 {
+            let x = place + random.point() * (0.05 * size);
+            let first = ends.len() as u32;
+            for _ in 0..32 {
+                let triangle = triangles[random.below(near)];
+                let edge = random.below(3);
+                let on =
+                    triangle[edge].as_dvec3().lerp(triangle[(edge + 1) % 3].as_dvec3(), random.unit().into());
+                let direction = on - x.as_dvec3();
+                let steps =
+                    normal.dot((light.corner + place).as_dvec3() - x.as_dvec3()) / normal.dot(direction);
+                let mut end = x.as_dvec3() + direction * steps;
+                let at = end - (light.corner + place).as_dvec3();
+                let [s, t] = [at.dot(light.u.as_dvec3()), at.dot(light.v.as_dvec3())];
+                let [s, t] =
+                    [s / f64::from(light.u.length_squared()), t / f64::from(light.v.length_squared())];
+                if !(steps > 0.0 && s.abs() < 3.0 && t.abs() < 3.0) {
+                    end = (light.at(random.unit(), random.unit()) + place).as_dvec3();
+                }
+                let bits = f64::from(f32::EPSILON * random.any_scale(-1.0, 2.0) * end.length() as f32);
+                ends.push((end + random.point().as_dvec3() * bits).as_vec3());
+            }
+            points.push(TilePoint { x: x.into(), first, count: 32 });
+        }
+        let accel = Accel::from_triangles(&triangles, Quality::Medium);
+        let [xs, ys, zs] = [0, 1, 2].map(|axis| ends.iter().map(|end| end[axis]).collect::<Vec<f32>>());
+        let any = Targets::new(&xs, &ys, &zs).expect("of one length");
+        let flat = any.on_parallelogram(light.corner + place, light.u, light.v);
+        let single = On { bvh: accel.bvh(), family: Family::Scalar };
+        let mut want = vec![0u64; ends.len() / 64];
+        for (i, &end) in ends.iter().enumerate() {
+            let hit = single.occluded(&Ray::segment(points[i / 32].x, end), None, &mut Counts::default());
+            want[i / 64] |= u64::from(hit) << (i % 64);
+            total[usize::from(hit)] += 1;
+        }
+        for on in families(accel.bvh()) {
+            for targets in [any, flat] {
+                let mut blocked = vec![0; want.len()];
+                on.occluded_tile(&points, &targets, None, &mut Counts::default(), &mut scratch, &mut blocked);
+                assert_eq!(blocked, want, "{}: {triangles:?}", on.family);
+            }
+            for (k, point) in points.iter().enumerate() {
+                let some = point.first as usize..point.first as usize + 32;
+                let targets =
+                    Targets::new(&xs[some.clone()], &ys[some.clone()], &zs[some]).expect("of one length");
+                let mut blocked = [0];
+                on.occluded_batch(point.x, &targets, None, &mut Counts::default(), &mut batch, &mut blocked);
+                assert_eq!(
+                    blocked[0],
+                    want[k / 2] >> (k % 2 * 32) & 0xffff_ffff,
+                    "{}: {triangles:?}",
+                    on.family
+                );
+            }
+        }
+    }
+    assert!(total.iter().all(|&rays| rays > 200_000), "{total:?}");
 }
 
 /// Walls along the axes that a light touches, which is turned to them: their planes are told from its corners by the last

@@ -12,7 +12,7 @@
 //! where o is how far the samples stand off the light's plane, in units of n = u x v.
 
 use super::batch::targets_from;
-use super::pyramid::{CAUTION, Forms, Shift, View, extent, in_range};
+use super::pyramid::{CAUTION, Forms, Shift, View, extent, in_range, span_of};
 use super::shaft::Shaft;
 use super::tile::TilePoint;
 use super::{Bvh, FARTHEST, ROUNDING, Targets};
@@ -262,7 +262,7 @@ impl<S: Simd> Bvh<'_, S> {
         if met == 0 {
             return;
         }
-        let outline = views.view.outline(token, seen, Some(&views.shift));
+        let outline = views.view.outline(token, seen, span_of(from_x), Some(&views.shift));
         let known = outline.known.bits();
         let mut left = met & (!known | outline.open.bits());
         if left == 0 {
@@ -398,6 +398,13 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
         one(flat.slack[1]) + half * off[1].abs() + steep * one(sizes[1]) * farthest + lean * t_most,
         half * off[2].abs() + lean + by_height.abs() * farthest * one(16.0 * ROUNDING * sizes[2]),
     ];
+    // And what it does to a form where it is moved and asked.
+    let forms = one(8.0 * ROUNDING);
+    let asked = [
+        forms.mul_add(s_most + to[0].abs(), error[0]),
+        forms.mul_add(t_most + to[1].abs(), error[1]),
+        forms.mul_add(to[2].abs(), error[2]),
+    ];
     let depth = to[2];
     let by_depth = one(1.0) / depth;
     let wide = [error[0] * one(4.0), error[1] * one(4.0), error[2] * one(4.0)];
@@ -418,6 +425,7 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
     let clear = clear & one(0.5).lt(depth) & depth.lt(one(2.0)) & error[2].lt(one(0.01));
     let view = View {
         rounding,
+        by_reach: one(16.0 * ROUNDING / flat.position),
         sides,
         depth: [depth - wide[2], depth + wide[2]],
         by_depth: by_depth * one(1.05),
@@ -432,7 +440,7 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
         away(plane, u, s0, v, t1),
         away(plane, u, s1, v, t1),
     ];
-    (Views { x, rows, view, shift: Shift { to, error }, corners }, clear.bits())
+    (Views { x, rows, view, shift: Shift { to, error: asked }, corners }, clear.bits())
 }
 
 #[inline(always)]

@@ -45,8 +45,17 @@ const EASY: u32 = 3;
 /// A block is tested ray by ray for as many targets or fewer.
 const LEAF_LONE: u32 = 3;
 
-/// Bounds on rounding are this many units of the textbook's first-order bounds.
+/// What positions are off by in these bounds, in units of the textbook's: 32 roundings of the greatest of them.
+///
+/// With P the greatest component of a triangle's vertices, seen from x, and u the rounding of one operation: the exact test
+/// finds each sheared coordinate to 5 u P, and by their products, where a form is all but 0, to 2 u P more; S, T and W are
+/// sums of three products, to 3 u P |row|. That is as if the vertices were off by 10 u P, and moves a form, which is linear
+/// in two of them, by twice that at most; its own products and sums add 10 u of their terms, and the rounding of s and t 3 u
+/// of theirs. All that is less than 30 u P in each place of the bound on a form, where these are 32.
 pub(super) const CAUTION: f32 = 2.0;
+
+/// Triangles that are nearer to x than this part of all positions count as no nearer, so that no bound vanishes.
+const NEAREST_PART: f32 = 1.0 / 1024.0;
 
 /// Subtrees yet to visit: how deep each begins, and the targets it may hide.
 pub(super) type Stack = ArrayVec<(Child, f32, u64), STACK>;
@@ -72,6 +81,8 @@ pub(super) struct Pyramid {
     rounding: Vec3,
     /// Greatest distance of anything from x, along an axis.
     reach: f32,
+    /// One over the least depth, and more where targets are farther away than that.
+    by_depth: f32,
     planes: [Plane; 5],
     /// `before[axis][k]`: targets in the cells before cell `k` of that axis. Filled when first needed.
     before: [[u64; CELLS + 1]; 2],
@@ -148,10 +159,13 @@ impl Forms {
 pub(super) struct View<L> {
     /// What S, T and W of a position may be off by.
     pub(super) rounding: [L; 3],
+    /// One over the greatest component of any position from x.
+    pub(super) by_reach: L,
     /// Least and greatest S/W, then T/W, of the targets.
     pub(super) sides: [L; 4],
-    /// Least and greatest W of the targets, and one over the least.
+    /// Least and greatest W of the targets.
     pub(super) depth: [L; 2],
+    /// One over the least, and as many times more as the targets are farther away than anything in the scene.
     pub(super) by_depth: L,
     /// Least and greatest s, then t, that forms are asked for.
     pub(super) rectangle: [L; 4],
@@ -199,12 +213,13 @@ impl<L: Lanes> View<L> {
         open & (-dw).le(deepest) & nearest.le(self.depth[1] + dw)
     }
 
-    /// The forms of triangles.
+    /// The forms of triangles; `span` is the greatest component of their vertices from x.
     #[inline(always)]
     pub(super) fn outline(
         &self,
         token: L::Token,
         [a, b, c]: [[L; 3]; 3],
+        span: L,
         shift: Option<&Shift<L>>,
     ) -> Outline<L> {
         let one = |value: f32| L::splat(token, value);
@@ -217,17 +232,26 @@ impl<L: Lanes> View<L> {
         let (ab, bc, ca) = (vec3x::cross(a, b), vec3x::cross(b, c), vec3x::cross(c, a));
         let volume = ab[0] * c[0] + ab[1] * c[1] + ab[2] * c[2];
 
-        // First-order bounds: each component of a vertex off by its rounding, and the products by theirs.
-        let big_s = a[0].abs().max(b[0].abs()).max(c[0].abs());
-        let big_t = a[1].abs().max(b[1].abs()).max(c[1].abs());
-        let big_w = a[2].abs().max(b[2].abs()).max(c[2].abs());
-        let deep = one(1.0) + big_w * self.by_depth;
-        let bound = ds * (big_t * deep + far_t * big_w)
-            + dt * (big_s * deep + far_s * big_w)
-            + dw * (far_s * big_t + far_t * big_s);
-        let mut bound = bound * one(4.0);
-        let volume_bound = ds * big_t * big_w + dt * big_s * big_w + dw * big_s * big_t;
-        let volume_bound = volume_bound * one(6.0);
+        // What a vertex is off by goes with how far the triangle is from x. No size below that, so that it bounds the
+        // second order too.
+        let part = (span * self.by_reach).max(one(NEAREST_PART));
+        let big_s = a[0].abs().max(b[0].abs()).max(c[0].abs().max(ds * part));
+        let big_t = a[1].abs().max(b[1].abs()).max(c[1].abs().max(dt * part));
+        let big_w = a[2].abs().max(b[2].abs()).max(c[2].abs().max(dw * part));
+        // Bounds on a form: by its vertices, and by the coordinates of targets.
+        let aside = ds * big_t + dt * big_s + dw * (far_s * big_t + far_t * big_s);
+        let of_vertices = (aside + (ds * far_t + dt * far_s) * big_w) * part;
+        let far = big_w * self.by_depth;
+        let of_targets = aside * far;
+        let mut bound = match shift {
+            // Of targets the shift tells.
+            Some(_) => of_vertices * w1,
+            None => of_vertices + of_targets * one(0.25),
+        };
+        // Depth is told with more care: the test of a single ray finds it in another way.
+        let with_care = (of_vertices + of_targets) * one(4.0);
+        let across = dw * big_s * big_t;
+        let volume_bound = (ds * big_t * big_w + dt * big_s * big_w + across) * (part * one(6.0));
         let sign = L::select(volume.lt(zero), one(-1.0), one(1.0));
         let volume = volume.abs();
 
@@ -250,7 +274,7 @@ impl<L: Lanes> View<L> {
         let every = bound.lt(low);
         // Beyond every target, or before all of them.
         let sum = [ab[0] + bc[0] + ca[0], ab[1] + bc[1] + ca[1], ab[2] + bc[2] + ca[2]];
-        let depth_bound = volume_bound + bound * one(3.0) * w1;
+        let depth_bound = volume_bound + across * far + (bound + with_care) * one(3.0) * w1;
         let (low_sum, high_sum) = (lowest(sum, s0, s1, t0, t1), highest(sum, s0, s1, t0, t1));
         let [m0, m1] = self.scale;
         let reached = volume.le((high_sum * m1).max(high_sum * m0) + depth_bound);
@@ -460,6 +484,7 @@ impl Pyramid {
         let near = Vec3::new(least_of(near[0]), least_of(near[1]), least_of(near[2])).min(Vec3::ZERO);
         let far = Vec3::new(greatest_of(far[0]), greatest_of(far[1]), greatest_of(far[2])).max(Vec3::ZERO);
         this.farthest = far.max(-near).max_element();
+        this.by_depth = (this.farthest / this.reach).max(1.0) / least.z;
         this.lower = x + near - position;
         this.upper = x + far + position;
         true
@@ -484,6 +509,7 @@ impl Pyramid {
         greatest: Vec3::ZERO,
         rounding: Vec3::ZERO,
         reach: 0.0,
+        by_depth: 0.0,
         planes: [Plane { normal: Vec3::ZERO, offset: 0.0, side: [0; 3] }; 5],
         before: [[0; CELLS + 1]; 2],
         scale: [0.0; 2],
@@ -691,9 +717,10 @@ impl Pyramid {
         let rectangle = [one(self.least.x), one(self.greatest.x), one(self.least.y), one(self.greatest.y)];
         let view = View {
             rounding: [one(self.rounding.x), one(self.rounding.y), one(self.rounding.z)],
+            by_reach: one(1.0 / self.reach),
             sides: rectangle,
             depth: [w0, w1],
-            by_depth: one(1.0 / self.least.z),
+            by_depth: one(self.by_depth),
             rectangle,
             scale: [w0, w1],
         };
@@ -709,7 +736,8 @@ impl Pyramid {
         if left == 0 {
             return;
         }
-        let outline = view.outline(token, [a, b, c], None);
+        let span = span_of(from_x);
+        let outline = view.outline(token, [a, b, c], span, None);
         let known = outline.known.bits();
         left &= !known | outline.open.bits();
         if left == 0 {
@@ -734,8 +762,7 @@ impl Pyramid {
         let n_size = (e_size[1] * f_size[2] + e_size[2] * f_size[1])
             + (e_size[2] * f_size[0] + e_size[0] * f_size[2])
             + (e_size[0] * f_size[1] + e_size[1] * f_size[0]);
-        let far = vec3x::most(vec3x::abs(a)).max(vec3x::most(vec3x::abs(b))).max(vec3x::most(vec3x::abs(c)));
-        let far = far.max(S::Node::splat(token, self.farthest));
+        let far = span_of([a, b, c]).max(S::Node::splat(token, self.farthest));
         let bound = n_size * far * S::Node::splat(token, 8.0 * ROUNDING);
         let plane = vec3x::dot(n, a);
         let mut low = S::Node::splat(token, 0.0);
@@ -843,6 +870,12 @@ impl Pyramid {
         }
         blocked
     }
+}
+
+/// The greatest component of three vectors.
+#[inline(always)]
+pub(super) fn span_of<L: Lanes>([a, b, c]: [[L; 3]; 3]) -> L {
+    vec3x::most(vec3x::abs(a)).max(vec3x::most(vec3x::abs(b))).max(vec3x::most(vec3x::abs(c)))
 }
 
 /// The cell of a scaled coordinate; what lies outside goes to the first or the last.
