@@ -257,13 +257,13 @@ impl<S: Simd> Bvh<'_, S> {
             return;
         }
         let facet = Facet::new(flat, block, lane);
-        let met = met & views.crosses(token, flat, &facet, from_x);
-        let met = met.bits() & *open;
+        let [crosses, aside] = views.crosses(token, flat, &facet, from_x);
+        let met = (met & crosses).bits() & *open;
         if met == 0 {
             return;
         }
         let outline = views.view.outline(token, seen, span_of(from_x), Some(&views.shift));
-        let known = outline.known.bits();
+        let known = (outline.known & aside).bits();
         let mut left = met & (!known | outline.open.bits());
         if left == 0 {
             return;
@@ -400,7 +400,7 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
     ];
     // And what it does to a form where it is moved and asked.
     let forms = one(8.0 * ROUNDING);
-    let asked = [
+    let error = [
         forms.mul_add(s_most + to[0].abs(), error[0]),
         forms.mul_add(t_most + to[1].abs(), error[1]),
         forms.mul_add(to[2].abs(), error[2]),
@@ -440,7 +440,7 @@ fn views<L: Lanes>(token: L::Token, flat: &Flat, x: Vec3x<L>) -> (Views<L>, u32)
         away(plane, u, s0, v, t1),
         away(plane, u, s1, v, t1),
     ];
-    (Views { x, rows, view, shift: Shift { to, error: asked }, corners }, clear.bits())
+    (Views { x, rows, view, shift: Shift { to, error }, corners }, clear.bits())
 }
 
 #[inline(always)]
@@ -475,9 +475,10 @@ impl<L: Lanes> Views<L> {
         ]
     }
 
-    /// Points that have some target on the other side of the triangle's plane. `from_x` are its vertices from x.
+    /// Points that have some target on the other side of the triangle's plane, and those that are surely off it, on the
+    /// side that the exact test finds too. `from_x` are its vertices from x.
     #[inline(always)]
-    fn crosses(&self, token: L::Token, flat: &Flat, facet: &Facet, from_x: [Vec3x<L>; 3]) -> L::Mask {
+    fn crosses(&self, token: L::Token, flat: &Flat, facet: &Facet, from_x: [Vec3x<L>; 3]) -> [L::Mask; 2] {
         let &Facet { normal, sizes, bound, .. } = facet;
         let thick = 0.5 * (flat.greatest[2] - flat.least[2]) * normal.dot(flat.normal).abs();
         let bound = L::splat(token, bound + thick);
@@ -488,6 +489,7 @@ impl<L: Lanes> Views<L> {
         let away = [farthest(from_x, 0), farthest(from_x, 1), farthest(from_x, 2)];
         let mut high = x.mul_add(away[0], y.mul_add(away[1], z * away[2]));
         let mut low = -high;
+        let aside = (high + high).lt(plane.abs());
         let mut k = 0;
         while k < 4 {
             let [x, y, z] = self.corners[k];
@@ -495,7 +497,7 @@ impl<L: Lanes> Views<L> {
             (low, high) = (low.min(at - bound), high.max(at + bound));
             k += 1;
         }
-        low.le(plane) & plane.le(high)
+        [low.le(plane) & plane.le(high), aside]
     }
 }
 

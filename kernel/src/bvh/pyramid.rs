@@ -16,7 +16,7 @@
 //! asked again with the test of [`crate::triangle`]. So the answers are those of a single ray, bit for bit, and
 //! as watertight.
 //!
-//! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by the same bound.
+//! Boxes are culled against the planes of the pyramid from x over the rectangle, widened by more than that.
 
 use super::batch::BatchScratch;
 use super::packet::Rays;
@@ -45,17 +45,20 @@ const EASY: u32 = 3;
 /// A block is tested ray by ray for as many targets or fewer.
 const LEAF_LONE: u32 = 3;
 
-/// What positions are off by in these bounds, in units of the textbook's: 32 roundings of the greatest of them.
+/// Positions are taken to be off by 16 times as many roundings of the greatest of them: 32.
 ///
 /// With P the greatest component of a triangle's vertices, seen from x, and u the rounding of one operation: the exact test
 /// finds each sheared coordinate to 5 u P, and by their products, where a form is all but 0, to 2 u P more; S, T and W are
-/// sums of three products, to 3 u P |row|. That is as if the vertices were off by 10 u P, and moves a form, which is linear
-/// in two of them, by twice that at most; its own products and sums add 10 u of their terms, and the rounding of s and t 3 u
-/// of theirs. All that is less than 30 u P in each place of the bound on a form, where these are 32.
+/// sums of three products, to 3 u P |row|. That is as if the vertices were off by 10 u P. A form is linear in two of them,
+/// hence 20 u P; its own products and sums add 10 u of their terms. All that is less than 32 u P in each place of the bound on
+/// a form. The places s and t of targets are off by 4 u of their terms.
 pub(super) const CAUTION: f32 = 2.0;
 
 /// Triangles that are nearer to x than this part of all positions count as no nearer, so that no bound vanishes.
 const NEAREST_PART: f32 = 1.0 / 1024.0;
+
+/// Volumes below are not told from 0.
+const SMALLEST: f32 = 1e-36;
 
 /// Subtrees yet to visit: how deep each begins, and the targets it may hide.
 pub(super) type Stack = ArrayVec<(Child, f32, u64), STACK>;
@@ -77,7 +80,7 @@ pub(super) struct Pyramid {
     /// Least and greatest s, t and w.
     least: Vec3,
     greatest: Vec3,
-    /// What position components are off by, and the bounds in S, T and W that follow.
+    /// What S, T and W of the farthest position may be off by.
     rounding: Vec3,
     /// Greatest distance of anything from x, along an axis.
     reach: f32,
@@ -157,7 +160,7 @@ impl Forms {
 
 /// The targets as seen from x, in the coordinates S, T and W: a triangle a lane, or a point a lane.
 pub(super) struct View<L> {
-    /// What S, T and W of a position may be off by.
+    /// What S, T and W of the farthest position may be off by; of nearer ones as much less as they are nearer.
     pub(super) rounding: [L; 3],
     /// One over the greatest component of any position from x.
     pub(super) by_reach: L,
@@ -165,7 +168,8 @@ pub(super) struct View<L> {
     pub(super) sides: [L; 4],
     /// Least and greatest W of the targets.
     pub(super) depth: [L; 2],
-    /// One over the least, and as many times more as the targets are farther away than anything in the scene.
+    /// One over the least. More where the targets are farther away than anything in the scene, unless a shift tells
+    /// what they are off by.
     pub(super) by_depth: L,
     /// Least and greatest s, then t, that forms are asked for.
     pub(super) rectangle: [L; 4],
@@ -179,7 +183,7 @@ pub(super) struct Outline<L: Lanes> {
     volume: L,
     bound: L,
     depth_bound: L,
-    /// Large enough to be told from an edge.
+    /// Large enough to be told from one seen edge-on.
     pub(super) known: L::Mask,
     /// If known, may block something.
     pub(super) open: L::Mask,
@@ -232,8 +236,8 @@ impl<L: Lanes> View<L> {
         let (ab, bc, ca) = (vec3x::cross(a, b), vec3x::cross(b, c), vec3x::cross(c, a));
         let volume = ab[0] * c[0] + ab[1] * c[1] + ab[2] * c[2];
 
-        // What a vertex is off by goes with how far the triangle is from x. No size below that, so that it bounds the
-        // second order too.
+        // What a vertex is off by goes with how far the triangle is from x. No size counts as less than that, so that
+        // the second order is bounded too.
         let part = (span * self.by_reach).max(one(NEAREST_PART));
         let big_s = a[0].abs().max(b[0].abs()).max(c[0].abs().max(ds * part));
         let big_t = a[1].abs().max(b[1].abs()).max(c[1].abs().max(dt * part));
@@ -246,7 +250,7 @@ impl<L: Lanes> View<L> {
         let mut bound = match shift {
             // Of targets the shift tells.
             Some(_) => of_vertices * w1,
-            None => of_vertices + of_targets * one(0.25),
+            None => of_vertices + of_targets * one(0.5),
         };
         // Depth is told with more care: the test of a single ray finds it in another way.
         let with_care = (of_vertices + of_targets) * one(4.0);
@@ -274,7 +278,12 @@ impl<L: Lanes> View<L> {
         let every = bound.lt(low);
         // Beyond every target, or before all of them.
         let sum = [ab[0] + bc[0] + ca[0], ab[1] + bc[1] + ca[1], ab[2] + bc[2] + ca[2]];
-        let depth_bound = volume_bound + across * far + (bound + with_care) * one(3.0) * w1;
+        let forms_bound = (bound + with_care) * one(3.0);
+        let forms_bound = match shift {
+            Some(_) => forms_bound * w1.max(one(1.0)),
+            None => forms_bound * w1,
+        };
+        let depth_bound = volume_bound + across * far + forms_bound;
         let (low_sum, high_sum) = (lowest(sum, s0, s1, t0, t1), highest(sum, s0, s1, t0, t1));
         let [m0, m1] = self.scale;
         let reached = volume.le((high_sum * m1).max(high_sum * m0) + depth_bound);
@@ -284,7 +293,7 @@ impl<L: Lanes> View<L> {
             volume,
             bound,
             depth_bound,
-            known: volume_bound.lt(volume),
+            known: volume_bound.max(one(SMALLEST)).lt(volume),
             open: (-bound).le(high) & reached,
             every,
             before,
@@ -485,6 +494,9 @@ impl Pyramid {
         let far = Vec3::new(greatest_of(far[0]), greatest_of(far[1]), greatest_of(far[2])).max(Vec3::ZERO);
         this.farthest = far.max(-near).max_element();
         this.by_depth = (this.farthest / this.reach).max(1.0) / least.z;
+        if !this.by_depth.is_finite() {
+            return false;
+        }
         this.lower = x + near - position;
         this.upper = x + far + position;
         true
@@ -731,14 +743,15 @@ impl Pyramid {
 
         // Planes with x and all targets on one side, from unscaled positions: the surface x lies on and the
         // light's own plane are told from things in between by the clearance alone.
-        open = open & self.crosses(simd, from_x);
+        let span = span_of(from_x);
+        let [crosses, aside] = self.crosses(simd, from_x, span);
+        open = open & crosses;
         let mut left = open.bits();
         if left == 0 {
             return;
         }
-        let span = span_of(from_x);
         let outline = view.outline(token, [a, b, c], span, None);
-        let known = outline.known.bits();
+        let known = (outline.known & aside).bits();
         left &= !known | outline.open.bits();
         if left == 0 {
             return;
@@ -751,9 +764,15 @@ impl Pyramid {
         outline.store(forms, from);
     }
 
-    /// Triangles, by their vertices from x, whose planes may pass between x and a target.
+    /// Triangles, by their vertices from x, whose planes may pass between x and a target; and those whose planes x is
+    /// surely off, on the side that the exact test finds too.
     #[inline(always)]
-    fn crosses<S: Simd>(&self, simd: S, [a, b, c]: [[S::Node; 3]; 3]) -> <S::Node as Lanes>::Mask {
+    fn crosses<S: Simd>(
+        &self,
+        simd: S,
+        [a, b, c]: [[S::Node; 3]; 3],
+        span: S::Node,
+    ) -> [<S::Node as Lanes>::Mask; 2] {
         let token = simd.token();
         let (e, f) = (vec3x::sub(b, a), vec3x::sub(c, a));
         let (e_size, f_size) = (vec3x::abs(e), vec3x::abs(f));
@@ -762,8 +781,9 @@ impl Pyramid {
         let n_size = (e_size[1] * f_size[2] + e_size[2] * f_size[1])
             + (e_size[2] * f_size[0] + e_size[0] * f_size[2])
             + (e_size[0] * f_size[1] + e_size[1] * f_size[0]);
-        let far = span_of([a, b, c]).max(S::Node::splat(token, self.farthest));
-        let bound = n_size * far * S::Node::splat(token, 8.0 * ROUNDING);
+        let far = span.max(S::Node::splat(token, self.farthest));
+        let n_bound = n_size * S::Node::splat(token, 8.0 * ROUNDING);
+        let bound = n_bound * far;
         let plane = vec3x::dot(n, a);
         let mut low = S::Node::splat(token, 0.0);
         let mut high = low;
@@ -778,7 +798,8 @@ impl Pyramid {
             k += 1;
         }
         // `low` and `high` start at 0, where x is.
-        (low - bound).le(plane) & plane.le(high + bound)
+        let aside = (n_bound * (span + span)).lt(plane.abs());
+        [(low - bound).le(plane) & plane.le(high + bound), aside]
     }
 
     /// A position in the pyramid's coordinates.

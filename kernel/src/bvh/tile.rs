@@ -367,13 +367,16 @@ impl<S: Simd> Bvh<'_, S> {
             // A list that is not all there is would be asked for nothing as often as not.
             given.count = 0;
         }
-        let mut parts = complete || !beams.instead_of_parts();
-        if parts && !complete && fine {
-            parts = *coarse == 0;
+        let mut apart = fine && shaft.is_some() && points.len() > PART;
+        if complete {
+            apart &= given.count > SHORT;
+        } else if apart && !beams.instead_of_parts() {
+            apart = *coarse == 0;
             *coarse = coarse.saturating_sub(1);
+        } else {
+            apart = false;
         }
         let work = &mut Work { batch, learned, packet, abreast, walls: &mut walls, beams };
-        let apart = fine && parts && points.len() > PART && !(complete && given.count <= SHORT);
         let Some(whole) = shaft.as_ref().filter(|_| apart) else {
             let shaft = shaft.as_ref();
             let mut rest = points;
@@ -403,8 +406,8 @@ impl<S: Simd> Bvh<'_, S> {
         let mut k = 0;
         while k < points.len() {
             if !complete && tried == TRIED && useful == 0 {
-                let rest = &points[k..];
                 *coarse = COARSE;
+                let rest = &points[k..];
                 self.ask_points(None, false, rest, targets, cut, given, ignore, counter, work, blocked);
                 return;
             }
