@@ -84,7 +84,7 @@ pub(super) struct Pyramid {
     rounding: Vec3,
     /// Greatest distance of anything from x, along an axis.
     reach: f32,
-    /// One over the least depth, and more where targets are farther away than that.
+    /// One over the least depth, and more where targets are farther away than the reach.
     by_depth: f32,
     planes: [Plane; 5],
     /// `before[axis][k]`: targets in the cells before cell `k` of that axis. Filled when first needed.
