@@ -466,12 +466,13 @@ fn slivers_around_a_point() {
         }
         let points = [0, 16].map(|first| TilePoint { x: [0.0; 3], first, count: 16 });
         let mut count = Counts::default();
-        let on = On { bvh: accel.bvh(), family: Family::Native };
-        let mut blocked = [0];
-        on.occluded_batch([0.0; 3], &targets, None, &mut count, &mut batch, &mut blocked);
-        assert_eq!(blocked[0] & !want, 0, "batch, trial {trial}: {sliver:?}");
-        on.occluded_tile(&points, &targets, None, &mut count, &mut scratch, &mut blocked);
-        assert_eq!(blocked[0] & !want, 0, "tile, trial {trial}: {sliver:?}");
+        for on in families(accel.bvh()) {
+            let mut blocked = [0];
+            on.occluded_batch([0.0; 3], &targets, None, &mut count, &mut batch, &mut blocked);
+            assert_eq!(blocked[0] & !want, 0, "{}, batch, trial {trial}: {sliver:?}", on.family);
+            on.occluded_tile(&points, &targets, None, &mut count, &mut scratch, &mut blocked);
+            assert_eq!(blocked[0] & !want, 0, "{}, tile, trial {trial}: {sliver:?}", on.family);
+        }
     }
     assert!(total.iter().all(|&rays| rays > 10_000), "{total:?}");
 }

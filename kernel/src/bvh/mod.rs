@@ -364,7 +364,7 @@ impl<'a, S: Simd> Bvh<'a, S> {
     /// same plane: 32 roundings of the scene's greatest coordinate. For [`offset`].
     ///
     /// It covers the error of a point computed on a triangle and the error of the triangle test (see
-    /// [`crate::triangle`]; each sheared vertex is off by up to four roundings of its distance from the origin,
+    /// [`crate::triangle`]; each sheared vertex is off by up to five roundings of its distance from the origin,
     /// which two points of the scene bound by twice the greatest coordinate).
     #[inline]
     pub fn clearance(&self) -> f32 {
